@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from mlbatch.arrays import BoolArray, F64Array, I64Array, U16Array, median
+from mlbatch.arrays import BoolArray, F64Array, I64Array, U16Array, U32Array, median
 from mlbatch.lidar.geometry import rotor_ticks
 from mlbatch.types import ColumnHeaders
 from mlbatch.units import NS_PER_S
@@ -129,6 +129,8 @@ _STEP_NS = NS_PER_S
 _BIN_BITS = 16
 _BINS = 1 << _BIN_BITS
 _REVOLUTIONS_PER_TICK = 2.0**-32
+# Packets whose columns are looked up together.
+_PART = 1024
 # A dark sector is wider than so many steps between columns.
 _MIN_WIDTH = 2.5
 # A sector without columns is dark if the rotor passed it so often during gaps: random loss would
@@ -154,8 +156,8 @@ class _Packets:
 
     stamp_ns: I64Array  # of the first column
     host_ns: I64Array
-    first: F64Array  # angle of the first column, revolutions
-    last: F64Array  # angle of the last column, revolutions
+    first: U32Array  # angle of the first column, 2**-32 revolutions
+    last: U32Array  # angle of the last column, 2**-32 revolutions
     bins: U16Array  # (n, C) angle bins of all columns
 
     def __len__(self) -> int:
@@ -172,9 +174,7 @@ class _Packets:
 
     def mirrored(self) -> _Packets:
         """The same packets of a rotor that turns the other way."""
-        return _Packets(
-            self.stamp_ns, self.host_ns, -self.first % 1.0, -self.last % 1.0, ~self.bins
-        )
+        return _Packets(self.stamp_ns, self.host_ns, -self.first, -self.last, ~self.bins)
 
 
 class GapLoss:
@@ -206,14 +206,12 @@ class GapLoss:
     def add(self, headers: ColumnHeaders, host_ns: I64Array) -> None:
         """Add accepted packets (P,) in order of receive time; stamps on the sensor's clock."""
         measured = np.flatnonzero(headers.valid.any(axis=1))
-        first = rotor_ticks(headers.encoder[:, 0])
-        last = rotor_ticks(headers.encoder[:, -1])
         packets = _Packets(
             # A copy, so that the stamps of all columns are not kept in memory.
             headers.stamp_ns[:, 0].copy(),
             host_ns,
-            first.astype(np.float64) * _REVOLUTIONS_PER_TICK,
-            last.astype(np.float64) * _REVOLUTIONS_PER_TICK,
+            rotor_ticks(headers.encoder[:, 0]).astype(np.uint32),
+            rotor_ticks(headers.encoder[:, -1]).astype(np.uint32),
             # The higher bits of the words are cut off.
             (headers.encoder >> (32 - _BIN_BITS)).astype(np.uint16),
         )
@@ -284,7 +282,9 @@ def _in_order(parts: list[_Packets]) -> _Packets:
 def _missing(packets: _Packets, packet_ns: float) -> int:
     """Number of packets missing between these, which are sorted by stamp."""
     # Packets of equal stamps (one a return) count as one.
-    packets = packets.take(np.diff(packets.stamp_ns, prepend=packets.stamp_ns[:1] - 1) > 0)
+    is_next = np.diff(packets.stamp_ns, prepend=packets.stamp_ns[:1] - 1) > 0
+    if not is_next.all():
+        packets = packets.take(is_next)
     step_ns = np.diff(packets.stamp_ns).astype(np.float64)
     period_ns = _period_ns(step_ns, packet_ns)
     is_gap = step_ns > 1.5 * period_ns
@@ -296,8 +296,8 @@ def _missing(packets: _Packets, packet_ns: float) -> int:
         packets = packets.mirrored()
         speed = -speed
     gap_ns = step_ns[gap]
-    begin = packets.first[gap]
-    turned = packets.first[gap + 1] - begin
+    begin = _revolutions(packets.first[gap])
+    turned = _revolutions(packets.first[gap + 1]) - begin
     turned += np.rint(speed * gap_ns - turned)
     passed_ns = packets.host_ns[gap + 1] - packets.host_ns[gap]
     # A clock that was set also steps: then the rotor, or the capture host, did not move as long.
@@ -344,10 +344,15 @@ def _period_ns(step_ns: F64Array, packet_ns: float) -> float:
 
 def _speed(packets: _Packets, step_ns: F64Array, is_gap: BoolArray) -> float:
     """Speed of the rotor, revolutions per ns, over the steps that are no gaps."""
-    turned = np.diff(packets.first)
+    turned = np.diff(_revolutions(packets.first))
     turned -= np.rint(turned)
     time_ns = float(step_ns[~is_gap].sum())
     return float(turned[~is_gap].sum()) / time_ns if time_ns else 0.0
+
+
+def _revolutions(angle: U32Array) -> F64Array:
+    """Return angles in 2**-32 revolutions as revolutions."""
+    return angle.astype(np.float64) * _REVOLUTIONS_PER_TICK
 
 
 class _Sectors(NamedTuple):
@@ -374,16 +379,19 @@ def _dark_sectors(
     bare = _bare_sectors(packets.bins, column_revolutions)
     is_dark = np.count_nonzero(bare.passes(begin, turned), axis=0) >= _MIN_PASSES
     if not is_dark.all():
-        span = (packets.last - packets.first) % 1.0
+        span = _revolutions(packets.last - packets.first)
         span[span > 1 - _JITTER] = 0.0
         wide = np.flatnonzero(span > 1.5 * median(span))
-        is_dark |= bare.passes(packets.first[wide], span[wide]).any(axis=0)
+        is_dark |= bare.passes(_revolutions(packets.first[wide]), span[wide]).any(axis=0)
     return _Sectors(bare.begin[is_dark], bare.width[is_dark])
 
 
 def _bare_sectors(bins: U16Array, column_revolutions: float) -> _Sectors:
     """Sectors without a column; column_revolutions: step between columns, revolutions."""
-    bare = np.bincount(bins.ravel(), minlength=_BINS) == 0
+    bare = np.ones(_BINS, np.bool_)
+    # In parts, since numpy makes an index of 8 bytes for each bin.
+    for some in np.array_split(bins, len(bins) // _PART + 1):
+        bare[some] = False
     # Rotated so that no sector contains the end.
     first = int(np.argmin(bare))
     edge = np.diff(np.roll(bare, -first).astype(np.int8), append=np.int8(0))
