@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import NamedTuple, TypeAlias
 
 import numpy as np
@@ -145,16 +146,12 @@ class Projector:
         self._tables = len(lidar.firing_ns)
         # Labels of members with equal firing tables differ by one number in all slots.
         steps = self.labels - self.labels[0]
-        self._repeated_labels: npt.NDArray[np.uint64] | None = None
+        self._has_one_label = self._tables == 1 and bool((steps == steps[:, :1]).all())
         self._labels_stay = False
         self.label_steps = np.zeros(len(sources), np.uint64)
-        if self._tables == 1 and bool((steps == steps[:, :1]).all()):
-            self._repeated_labels = self.labels[:1].repeat(columns, axis=0)
+        if self._has_one_label:
             self.label_steps = steps[:, 0].copy()
         self.order = _firing_order(lidar)
-        self._elements = np.arange(columns * self.slots)
-        if self.order is not None and self._tables == 1:
-            self._elements = self._ordered(np.zeros(columns, np.int64)).reshape(-1)
         channel = lidar.channel if lidar.channel.ndim == 1 else np.arange(lidar.channels)
         number = channel[:, None] * lidar.returns + np.arange(lidar.returns)
         self.number: I64Array = number.reshape(-1)
@@ -165,11 +162,34 @@ class Projector:
         self.drops_duplicates = lidar.sends_twice and not sources[0].keep_repeated
         # Sensors whose rotor turns while beams fire are projected one by one.
         self.is_sorted = len(sources) > 1 and not isinstance(self.projection, Tabled)
-        self._records = np.empty((columns, lidar.records.size), np.uint8)
+        self._columns = columns
         self._record = np.dtype((np.void, lidar.records.size))
-        self._of_member = np.empty_like(self._records if len(sources) > 1 else self._records[:0])
-        self._range_m = np.empty((lidar.returns, columns, lidar.channels), np.float32)
         self._has_reflectivity = lidar.has_reflectivity and "reflectivity" in extras
+
+    # Arrays for the columns of a call, made when first used: compiled loops need none.
+
+    @cached_property
+    def _repeated_labels(self) -> npt.NDArray[np.uint64]:
+        return self.labels[:1].repeat(self._columns, axis=0)
+
+    @cached_property
+    def _elements(self) -> I64Array:
+        """Tile elements of all columns in firing order, if all have the same."""
+        if self.order is None:
+            return np.arange(self._columns * self.slots)
+        return self._ordered(np.zeros(self._columns, np.int64)).reshape(-1)
+
+    @cached_property
+    def _records(self) -> U8Array:
+        return np.empty((self._columns, self.lidar.records.size), np.uint8)
+
+    @cached_property
+    def _of_member(self) -> U8Array:
+        return np.empty_like(self._records)
+
+    @cached_property
+    def _range_m(self) -> F32Array:
+        return np.empty((self.lidar.returns, self._columns, self.lidar.channels), np.float32)
 
     def project(
         self, member: I64Array, ring_index: I64Array, encoder: I64Array, view: TileView
@@ -203,14 +223,14 @@ class Projector:
     def _label(self, member: I64Array, encoder: I64Array, view: TileView) -> None:
         """Write the labels but for what all slots of a column share."""
         words = view.label.view(np.uint64)
-        if self._repeated_labels is None:
+        if not self._has_one_label:
             self.labels.take(self._label_row(member, encoder), axis=0, out=words, mode="clip")
         elif not self._labels_stay:
             words[:] = self._repeated_labels[: len(words)]
 
     def label_once(self, tile: Tile) -> None:
         """Label a whole tile that no other projector uses; its labels stay from then on."""
-        if self._repeated_labels is not None:
+        if self._has_one_label:
             tile.label.view(np.uint64)[:] = self._repeated_labels.reshape(-1)
             self._labels_stay = True
 

@@ -271,17 +271,53 @@ class Turning:
         """
         tables = (table, *others)
         beams = table.direction.shape[1]
-        self._directions = [_Vectors(one.direction, columns, beams) for one in tables]
-        self._origins = [_Vectors(one.origin, columns, beams) for one in tables]
-        self.direction = self._directions[0].vectors
-        self.origin = self._origins[0].vectors
+        directions = [_vectors(one.direction, beams) for one in tables]
+        origins = [_vectors(one.origin, beams) for one in tables]
+        self.direction = directions[0]
+        self.origin = origins[0]
         self.origin_turns = bool(table.origin[:2].any())
-        self._reaches_m = [one.reach_m.astype(np.float32) for one in tables]
-        self.reach_m = self._reaches_m[0]
+        reaches_m = [one.reach_m.astype(np.float32) for one in tables]
+        self.reach_m = reaches_m[0]
         self.has_reach = any(bool(one.reach_m.any()) for one in tables)
         self.firing_ns = firing_ns.astype(np.float32)
         self.fires_at_once = not firing_ns.any()
-        self._repeated_ns = np.broadcast_to(self.firing_ns[0], (columns, beams)).copy()
+        self._members = list(zip(directions, origins, reaches_m, strict=True))
+        self._columns = columns
+        self._planes: _RotorPlanes | None = None
+
+    def prepare(self, member: I64Array, encoder: I64Array) -> None:
+        """Compute directions and origins of every beam at the angle at which it fires."""
+        self._made().prepare(member, encoder)
+
+    def project(self, range_m: F32Array, out: F32Array) -> None:
+        """(r + reach) * direction + origin."""
+        self._made().project(range_m, out)
+
+    def _made(self) -> _RotorPlanes:
+        """Return the planes, made when first asked for: compiled loops need none."""
+        if self._planes is None:
+            self._planes = _RotorPlanes(self, self._members, self._columns)
+        return self._planes
+
+
+class _RotorPlanes:
+    """Directions and origins of some columns of `Turning`, by axis, and scratch arrays for them."""
+
+    def __init__(
+        self,
+        turning: Turning,
+        members: Sequence[tuple[F32Array, F32Array, F32Array]],
+        columns: int,
+    ) -> None:
+        """members: directions, origins and reaches of each sensor; columns: as of `Turning`."""
+        beams = turning.direction.shape[2]
+        self._directions = [_Vectors(direction, columns) for direction, _, _ in members]
+        self._origins = [_Vectors(origin, columns) for _, origin, _ in members]
+        self._reaches_m = [reach_m for _, _, reach_m in members]
+        self._has_reach = turning.has_reach
+        self._firing_ns = turning.firing_ns
+        self._fires_at_once = turning.fires_at_once
+        self._repeated_ns = np.broadcast_to(self._firing_ns[0], (columns, beams)).copy()
         self._cosine = np.empty((columns, beams), np.float32)
         self._sine = np.empty((columns, beams), np.float32)
         self._delta = np.empty((columns, beams), np.float32)
@@ -292,14 +328,14 @@ class Turning:
         self._prepared: list[_Prepared] = []
 
     def prepare(self, member: I64Array, encoder: I64Array) -> None:
-        """Compute directions and origins of every beam at the angle at which it fires."""
+        """See `Turning`."""
         angle, speed, table = read_rotor_words(encoder)
         count = len(encoder)
         cosine = self._cosine[:count]
         sine = self._sine[:count]
         cosine[:] = np.cos(angle).astype(np.float32)[:, None]
         sine[:] = np.sin(angle).astype(np.float32)[:, None]
-        if not self.fires_at_once and speed.any():
+        if not self._fires_at_once and speed.any():
             self._add_firing_angles(cosine, sine, speed, table)
         self._prepared = []
         for number, own in enumerate(blocks(member, len(self._directions))):
@@ -311,12 +347,12 @@ class Turning:
                 self._prepared.append(_Prepared(own, direction, origin, reach_m))
 
     def project(self, range_m: F32Array, out: F32Array) -> None:
-        """(r + reach) * direction + origin."""
+        """See `Turning`."""
         for one in self._prepared:
             own = one.columns
             moved = self._scratch[own]
             reached_m = range_m[own]
-            if self.has_reach:
+            if self._has_reach:
                 reached_m = np.add(reached_m, one.reach_m, out=self._half[own])
             planes = zip(one.direction, one.origin, strict=True)
             for axis, (direction, origin) in enumerate(planes):
@@ -332,8 +368,8 @@ class Turning:
         600 rpm and 137 us.
         """
         count = len(speed)
-        one_table = len(self.firing_ns) == 1
-        firing_ns = self._repeated_ns[:count] if one_table else self.firing_ns[table]
+        one_table = len(self._firing_ns) == 1
+        firing_ns = self._repeated_ns[:count] if one_table else self._firing_ns[table]
         delta = self._delta[:count]
         half = self._half[:count]
         scratch = self._scratch[:count]
@@ -351,7 +387,7 @@ class Turning:
 
 
 class _Prepared(NamedTuple):
-    """Columns of a sensor, and the planes (n, B) of each axis that `Turning` made, m."""
+    """Columns of a sensor, and the planes (n, B) of each axis, m."""
 
     columns: slice
     direction: list[F32Array]
@@ -360,25 +396,18 @@ class _Prepared(NamedTuple):
 
 
 class _Vectors:
-    """Vectors V1, V2, V3 of every beam, repeated in planes (columns, B); see `_plane`.
+    """Vectors V1, V2, V3 of every beam, repeated in planes (columns, B); see `_plane`."""
 
-    vectors: (3 vectors, 3 axes, B) float32.
-    """
-
-    def __init__(self, vectors: F64Array, columns: int, beams: int) -> None:
-        """vectors: (3, B or 1, 3)."""
-        wide = np.broadcast_to(vectors, (3, beams, 3)).transpose(0, 2, 1)
-        self.vectors = wide.astype(np.float32, order="C")
+    def __init__(self, vectors: F32Array, columns: int) -> None:
+        """vectors: (3 vectors, 3 axes, B)."""
         # By axis: V1 and V2, None if both are zero.
         self._rotating = [
-            [_plane(one[axis], columns) for one in self.vectors[:2]]
-            if self.vectors[:2, axis].any()
-            else None
+            [_plane(one[axis], columns) for one in vectors[:2]] if vectors[:2, axis].any() else None
             for axis in range(3)
         ]
         # By axis: V3, and whether it is not zero.
-        self._constant = [_plane(one, columns) for one in self.vectors[2]]
-        self._has_constant = [bool(one.any()) for one in self.vectors[2]]
+        self._constant = [_plane(one, columns) for one in vectors[2]]
+        self._has_constant = [bool(one.any()) for one in vectors[2]]
 
     def at(
         self, cosine: F32Array, sine: F32Array, scratch: F32Array, out: F32Array
@@ -402,6 +431,13 @@ class _Vectors:
                 np.add(plane, constant[:count], out=plane)
             planes.append(plane)
         return planes
+
+
+def _vectors(vectors: F64Array, beams: int) -> F32Array:
+    """Return vectors (3, B or 1, 3) of the beams by axis: (3 vectors, 3 axes, B)."""
+    wide = np.broadcast_to(vectors, (3, beams, 3)).transpose(0, 2, 1)
+    by_axis: F32Array = wide.astype(np.float32, order="C")
+    return by_axis
 
 
 def _plane(values: F32Array, columns: int) -> F32Array:
