@@ -9,7 +9,7 @@ from __future__ import annotations
 import ipaddress
 import re
 from collections import Counter
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple, NoReturn
@@ -410,8 +410,19 @@ def _chosen(
 
 def describe(sampler: Sampler, kind: PacketKind) -> str | None:
     """Description of the packets of a kind by their content; None if no vendor recognises them."""
-    evidence = sampler.evidence(kind)
-    return sensors.describe(evidence.size, evidence.sample)
+    if kind in sampler.released:
+        return sampler.released[kind]
+    return sensors.describe(kind.size, sampler.kinds[kind].arrays()[0])
+
+
+def release(sampler: Sampler, kinds: Iterable[PacketKind]) -> None:
+    """Replace the sampled payloads of some kinds by their descriptions.
+
+    Some hundred packets of a lidar are 2 MB.
+    """
+    for kind in kinds:
+        sampler.released[kind] = describe(sampler, kind)
+        sampler.kinds[kind].payloads.clear()
 
 
 def _refuse_same_packets(table: StreamTable, found: Sequence[DetectedSensor], origin: Path) -> None:

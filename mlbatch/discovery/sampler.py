@@ -55,13 +55,15 @@ class KindSamples:
 class Sampler:
     """Keeps the first packets of every kind and some later ones, and counts them all.
 
-    crowd: decides which kinds, where there are very many.
+    crowd: decides which kinds, where there are very many; released: descriptions of kinds whose
+    payloads are no longer kept.
     """
 
     table: StreamTable
     # Samples of each kind, in receive order of their first packets.
     kinds: dict[PacketKind, KindSamples] = field(default_factory=dict)
     crowd: Crowd = field(default_factory=Crowd)
+    released: dict[PacketKind, str | None] = field(default_factory=dict)
     _kinds_of_ip: dict[str, list[PacketKind]] = field(default_factory=dict)
 
     def add(self, batch: PacketBatch) -> None:

@@ -11,6 +11,7 @@ import numpy as np
 
 from mlbatch.arrays import BoolArray, F64Array, U8Array
 from mlbatch.discovery.discover import Discovery, discover, refuse_absent, refuse_untimed
+from mlbatch.discovery.match import release
 from mlbatch.discovery.probe import is_without_packets
 from mlbatch.discovery.sampler import clock_watch
 from mlbatch.discovery.types import DetectedSensor, Note, PacketKind
@@ -78,6 +79,7 @@ class Session:
         self.sensors: list[Sensor] = []
         for found in self.setup.sensors:
             self.sensors.append(self._sensor(found))
+        release(self.setup.sampler, kinds & self.setup.sampler.kinds.keys())
         self.refuse_untimed()
         self.replay = self._replay()
         self.clocks = ClockMonitor(self.sensors, self.replay)
