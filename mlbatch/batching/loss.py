@@ -256,11 +256,14 @@ class GapLoss:
         """
         rows = _in_order(self._parts)
         final = int(np.searchsorted(rows.stamp_ns, rows.stamp_ns[-1] - _FINAL_NS))
-        while final >= 2 * _CHUNK:
+        begin = 0
+        while final - begin >= 2 * _CHUNK:
             # The last packet of a chunk is the first of the next, to count the step between them.
-            self._lost += _missing(rows.take(slice(_CHUNK + 1)), self._packet_ns)
-            rows = rows.take(slice(_CHUNK, None))
-            final -= _CHUNK
+            self._lost += _missing(rows.take(slice(begin, begin + _CHUNK + 1)), self._packet_ns)
+            begin += _CHUNK
+        if begin:
+            # A copy, so that packets that are evaluated are not kept in memory.
+            rows = rows.take(np.arange(begin, len(rows)))
         self._parts = [rows]
         self._waiting = len(rows)
 

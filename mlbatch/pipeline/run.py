@@ -17,6 +17,7 @@ from mlbatch.errors import NoScanError, RecordingError
 from mlbatch.pipeline import run_report
 from mlbatch.pipeline.conversion import Conversion, Progress, SkippedWindow
 from mlbatch.pipeline.decode_pool import DecodeTask, DecodeWorker
+from mlbatch.pipeline.freed_memory import return_freed_memory
 from mlbatch.pipeline.job import Job
 from mlbatch.pipeline.scan_task import ScanTask, forward
 from mlbatch.pipeline.workers import OrderedWorkers, run_inline
@@ -52,6 +53,7 @@ def convert(
     # One scan more than are waiting to be written: the one that is being decoded.
     decodes_ahead = job.jobs == 1 and open_writer is not None
     run = Conversion(job, buffers=_AHEAD + 1 if decodes_ahead else 1, progress=progress)
+    return_freed_memory()
     if resume_log is not None:
         resume_log.join(run)
     output = _Output(run, open_writer, resume_log)

@@ -41,7 +41,7 @@ CLOUDS = "clouds"
 _MOST = 0.5
 # Read at a time: each batch costs some calls a sensor, and memory grows with its size.
 _READ_BYTES_OF_SENSOR = 2 << 20
-_MOST_READ_BYTES = 16 << 20
+_MOST_READ_BYTES = 6 << 20
 
 
 class Session:

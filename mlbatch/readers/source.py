@@ -174,6 +174,7 @@ class Window:
         self.end = front
         self._front = front
         self._source = source
+        self._has_ended = False
         # Place in the file of byte 0 of `data`.
         self._origin = -front
 
@@ -201,6 +202,8 @@ class Window:
             self.end = front
             if skipped < left:
                 return False
+        if self._has_ended:
+            return False
         kept = self.end - self.begin
         unread = self.data[self.begin : self.end]
         self._origin += self.begin - front
@@ -217,6 +220,7 @@ class Window:
         if most > kept:
             stop = min(stop, front + most)
         count = self._source.fill(self.data.data[self.end : stop])
+        self._has_ended = count < stop - self.end
         self.end += count
         return count > 0
 
