@@ -632,14 +632,14 @@ def test_a_full_disk_names_the_remedy(shell: Shell, monkeypatch: pytest.MonkeyPa
 def test_an_unreadable_disk_names_the_remedy(
     shell: Shell, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    """The reader's buffer has 8 MB: the recording is longer, and breaks at its end."""
+    """The reader's buffer has 4 MB: the recording is longer, and breaks in its second half."""
     spec = replace(SMALL, beams=128, columns_per_frame=512)
     capture = write_session(tmp_path / "in", Unit(spec, turns=60))
     whole = _whole(shell, str(capture))
     fill = source.Source.fill
 
     def failing(opened: source.Source, target: memoryview) -> int:
-        if opened.position_bytes > 0.9 * opened.size_bytes and Path("out.partial").exists():
+        if opened.position_bytes > 0.5 * opened.size_bytes and Path("out.partial").exists():
             broken = OSError(5, "Input/output error")
             text = f"{opened.path}: could not read it (Input/output error); check the disk"
             raise RecordingError(text) from broken
