@@ -247,7 +247,8 @@ class GapLoss:
         self._waiting += len(packets)
         if self._waiting >= self._limit:
             self._evaluate()
-            self._limit = max(3 * _CHUNK, 2 * self._waiting)
+            # A share of those that wait: else the cost would grow with the square of their number.
+            self._limit = max(3 * _CHUNK, self._waiting + max(_CHUNK, self._waiting // 4))
 
     def _evaluate(self) -> None:
         """Evaluate the oldest packets whose order is final, chunk by chunk.

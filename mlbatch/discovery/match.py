@@ -27,6 +27,9 @@ from mlbatch.rig.rig import RigSensor, StreamSelector
 from mlbatch.sensors.advice import with_advice
 from mlbatch.types import StreamTable
 
+# Of the samples of a kind: some hundred packets of 1 kB are less.
+_LARGE_BYTES = 1 << 20
+
 
 class Matched(NamedTuple):
     """Sensors, kinds of no sensor, and why a matching calibration of a kind could not be used."""
@@ -416,13 +419,12 @@ def describe(sampler: Sampler, kind: PacketKind) -> str | None:
 
 
 def release(sampler: Sampler, kinds: Iterable[PacketKind]) -> None:
-    """Replace the sampled payloads of some kinds by their descriptions.
-
-    Some hundred packets of a lidar are 2 MB.
-    """
+    """Replace large samples of some kinds by descriptions; only `describe` can use them then."""
     for kind in kinds:
-        sampler.released[kind] = describe(sampler, kind)
-        sampler.kinds[kind].payloads.clear()
+        payloads = sampler.kinds[kind].payloads
+        if len(payloads) * kind.size > _LARGE_BYTES:
+            sampler.released[kind] = describe(sampler, kind)
+            payloads.clear()
 
 
 def _refuse_same_packets(table: StreamTable, found: Sequence[DetectedSensor], origin: Path) -> None:

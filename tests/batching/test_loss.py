@@ -6,6 +6,7 @@ sectors, rounded to whole us and 0.01 degrees as by vendors: packets taken out a
 
 from __future__ import annotations
 
+import tracemalloc
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -388,6 +389,29 @@ def test_chunks_of_long_recordings_do_not_depend_on_batches() -> None:
     for size in (997, 40_000, len(packets)):
         cuts = tuple(range(size, len(came), size))
         assert counted(rotor, packets.take(swapped), cuts) == lost
+
+
+def test_kept_packets_are_few_and_small() -> None:
+    """At most three chunks of 16384 and a batch: stamps of 8 bytes, angles of 4, bins of 2."""
+    packets = sent(FULL, 200_000)
+    batch = 1000
+    most = (3 * 16384 + 2 * batch) * (2 * 8 + 2 * 4 + 2 * FULL.columns)
+    objects = 200_000
+    # numpy imports modules at first use.
+    assert counted(FULL, packets.take(np.arange(batch))) == (0, 0)
+    loss = GapLoss(FULL.packet_ns)
+    tracemalloc.start()
+    try:
+        for begin in range(0, len(packets), batch):
+            one = packets.take(np.arange(begin, begin + batch))
+            valid = np.ones(one.words.shape, bool)
+            loss.add(ColumnHeaders(one.stamp_ns, one.words, valid), one.host_ns)
+            del one, valid
+            kept, _ = tracemalloc.get_traced_memory()
+            assert kept <= most + objects
+    finally:
+        tracemalloc.stop()
+    assert loss.lost == 0
 
 
 def test_a_packet_without_a_column_is_ignored() -> None:

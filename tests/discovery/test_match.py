@@ -3,13 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from mlbatch.discovery.discover import SensorSelection, discover
+from mlbatch.discovery.match import describe, release
+from mlbatch.readers import open_recording
+from mlbatch.types import StreamTable
 from tests.builders.captures import udp_frame, write_pcap
 from tests.builders.run import command
+from tests.builders.sessions import SMALL, Unit, write_session
 from tests.matrix.lidars import NS_PER_MS, NS_PER_S, VENDORS, Sent, Spell, write_metadata
 
 BEGIN_NS = 1_700_000_000 * NS_PER_S
@@ -106,3 +112,17 @@ def test_inspect_notes_it(tmp_path: Path) -> None:
     result = command("inspect", tmp_path / "drive.pcap")
     assert result.code == 0
     assert "several lidars share the address" in result.out
+
+
+def test_large_samples_are_replaced_by_descriptions(tmp_path: Path) -> None:
+    # 6 s of packets of 8448 bytes, of which 16 and six of each quarter of a second are sampled.
+    large = Unit(replace(SMALL, beams=128, columns_per_frame=512), turns=60)
+    for name, unit, is_large in (("large", large, True), ("small", Unit(SMALL, turns=2), False)):
+        table = StreamTable()
+        recording = open_recording(write_session(tmp_path / name, unit), table)
+        sampler = discover([recording], table, SensorSelection()).sampler
+        before = {kind: describe(sampler, kind) for kind in sampler.kinds}
+        release(sampler, sampler.kinds)
+        assert {kind: describe(sampler, kind) for kind in sampler.kinds} == before
+        released = [not one.payloads for one in sampler.kinds.values()]
+        assert any(released) == is_large
