@@ -17,7 +17,6 @@ if TYPE_CHECKING:
     from mlbatch.writers.base import WriterModule
 
 
-@lru_cache(maxsize=1)
 def built_in_names() -> tuple[str, ...]:
     """Return the names of the formats here, sorted, without importing them."""
     return tuple(sorted(module.name for module in pkgutil.iter_modules(__path__)))
