@@ -40,8 +40,8 @@ CLOUDS = "clouds"
 # Share of the bytes of a recording.
 _MOST = 0.5
 # Read at a time: each batch costs some calls a sensor, and memory grows with its size.
-_READ_BYTES_OF_SENSOR = 2 << 20
-_MOST_READ_BYTES = 6 << 20
+_READ_BYTES_OF_SENSOR = 4 << 20
+_MOST_READ_BYTES = 8 << 20
 
 
 class Session:
