@@ -39,8 +39,9 @@ CLOUDS = "clouds"
 
 # Share of the bytes of a recording.
 _MOST = 0.5
-# Read at a time: each batch costs some calls a sensor, and memory grows with its size.
-_READ_BYTES_OF_SENSOR = 4 << 20
+# Packets of each sensor to read at a time, between 4 MB and 8 MB in all: each batch costs some
+# calls a sensor, the columns of many small packets do not fit into the cache, and memory grows.
+_READ_PACKETS = 512
 _MOST_READ_BYTES = 8 << 20
 
 
@@ -74,7 +75,8 @@ class Session:
         is_mostly_lidar = self.setup.sampler.share_of(kinds) >= _MOST
         self._arena: PacketArena | None = None
         if self.engine == "native" and is_mostly_lidar:
-            read_bytes = _READ_BYTES_OF_SENSOR * len(self.setup.sensors)
+            sizes = [found.lidar.packet_size for found in self.setup.sensors]
+            read_bytes = _READ_PACKETS * sum(sizes)
             self._arena = PacketArena(min(max(read_bytes, BUFFER_BYTES), _MOST_READ_BYTES))
         self.sensors: list[Sensor] = []
         for found in self.setup.sensors:
