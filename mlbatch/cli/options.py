@@ -22,8 +22,6 @@ if TYPE_CHECKING:
     from mlbatch.faults import Fault
     from mlbatch.pipeline.shards import Shard
 
-# Every job needs memory for a few scans.
-
 
 def rate(text: str) -> Fraction:
     """`--rate`, exactly the number in the text."""
