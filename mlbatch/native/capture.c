@@ -14,6 +14,8 @@ enum { RECORD_BYTES = 16, ETHERNET_BYTES = 14, IP_BYTES = 20, UDP_BYTES = 8 };
 enum { IPV4_TYPE = 0x0800, UDP = 17, MORE_FRAGMENTS = 0x2000, FRAGMENT_OFFSET = 0x1FFF };
 /* Why a walk ends: `native/capture.py`. */
 enum { NO_ROOM, CUT, TOO_LONG };
+/* Headers of so many frames ahead are asked for: what was just read is in no near cache. */
+enum { FRAMES_AHEAD = 4 };
 
 static int64_t low(const uint8_t *byte)
 {
@@ -33,6 +35,16 @@ static int64_t high2(const uint8_t *byte)
 static int64_t word(const uint8_t *byte, int64_t is_swapped)
 {
     return is_swapped ? high(byte) : low(byte);
+}
+
+/* Ask for a line of 64 bytes. */
+static void prefetch(const uint8_t *at)
+{
+#if defined(__SSE2__)
+    _mm_prefetch((const char *)at, _MM_HINT_T0);
+#else
+    (void)at;
+#endif
 }
 
 /* Frames of the records in data[begin:end]: first byte, captured and original length, receive
@@ -58,6 +70,10 @@ EXPORT int64_t mlbatch_walk(const uint8_t *data, int64_t begin, int64_t end, int
             why = CUT;
             break;
         }
+        /* Most frames are as long as the one before. */
+        const int64_t ahead = place + FRAMES_AHEAD * (RECORD_BYTES + size);
+        if (ahead < end)
+            prefetch(data + ahead);
         columns[count] = place + RECORD_BYTES;
         columns[room + count] = size;
         columns[2 * room + count] = word(record + 12, is_swapped);
@@ -139,6 +155,67 @@ EXPORT int64_t mlbatch_dissect(const uint8_t *data, int64_t data_bytes, int64_t 
     return whole;
 }
 
+enum { FRAME, SOURCE, DESTINATION, IDENT, OFFSET, MORE, START, SIZE };
+enum { MOST_DATAGRAM_BYTES = 65535 };
+
+/* Join the fragments (8, count) of datagrams whose frames follow each other: each part is moved
+   down to the end of the one before. All others are left as they are, also those of a set
+   (source, destination, identification) that has other fragments before: sets (room, 3) begins
+   with the set_count open ones and takes those found. receive_ns (count) rises. Return the number
+   of datagrams (5, count); rest: numbers of the fragments that are left, rest_count of them. */
+EXPORT int64_t mlbatch_join(uint8_t *data, int64_t count, const int64_t *fragments,
+                            const int64_t *receive_ns, int64_t most_ns, int64_t set_count,
+                            int64_t room, int64_t *sets, int64_t *datagrams, int64_t *rest,
+                            int64_t *rest_count)
+{
+    const int64_t *column[SIZE + 1];
+    for (int one = 0; one <= SIZE; one++)
+        column[one] = fragments + one * count;
+    const int64_t *offset = column[OFFSET], *start = column[START], *size = column[SIZE];
+    int64_t whole = 0, left = 0;
+    for (int64_t first = 0, next; first < count; first = next) {
+        for (next = first + 1; next < count && column[MORE][next - 1]; next++) {
+            int follows = column[FRAME][next] == column[FRAME][next - 1] + 1
+                && offset[next] == offset[next - 1] + size[next - 1]
+                && start[next] >= start[next - 1] + size[next - 1];
+            for (int key = SOURCE; key <= IDENT; key++)
+                follows &= column[key][next] == column[key][first];
+            if (!follows)
+                break;
+        }
+        const int64_t last = next - 1, total = offset[last] + size[last];
+        const int64_t length = size[first] < UDP_BYTES ? 0 : high2(data + start[first] + 4);
+        int is_whole = offset[first] == 0 && !column[MORE][last] && total <= MOST_DATAGRAM_BYTES
+            && length >= UDP_BYTES && length <= total
+            && receive_ns[last] - receive_ns[first] <= most_ns && set_count < room;
+        for (int64_t set = 0; set < set_count && is_whole; set++)
+            is_whole = sets[3 * set] != column[SOURCE][first]
+                || sets[3 * set + 1] != column[DESTINATION][first]
+                || sets[3 * set + 2] != column[IDENT][first];
+        if (is_whole) {
+            const int64_t begin = start[first];
+            for (int64_t part = first + 1; part < next; part++)
+                memmove(data + begin + offset[part], data + start[part], (size_t)size[part]);
+            int64_t *out = datagrams + whole++;
+            out[0] = column[FRAME][last];
+            out[count] = begin + UDP_BYTES;
+            out[2 * count] = length - UDP_BYTES;
+            out[3 * count] = column[SOURCE][first];
+            out[4 * count] = high2(data + begin + 2);
+            continue;
+        }
+        for (int64_t part = first; part < next; part++)
+            rest[left++] = part;
+        if (set_count < room) {
+            for (int key = 0; key < 3; key++)
+                sets[3 * set_count + key] = column[SOURCE + key][first];
+            set_count++;
+        }
+    }
+    *rest_count = left;
+    return whole;
+}
+
 /* Copy source[source_at[i] : + bytes[i]] to target[target_at[i] : ...] for all i; source and
    target may be parts of one buffer, runs do not overlap. */
 EXPORT void mlbatch_copy(int64_t runs, const uint8_t *source, const int64_t *source_at,
@@ -167,16 +244,6 @@ static uint64_t word8(const uint8_t *at)
     uint64_t value;
     memcpy(&value, at, sizeof value);
     return value;
-}
-
-/* Ask for a line of 64 bytes. */
-static void prefetch(const uint8_t *at)
-{
-#if defined(__SSE2__)
-    _mm_prefetch((const char *)at, _MM_HINT_T0);
-#else
-    (void)at;
-#endif
 }
 
 /* Sum of the 64-bit words of `bytes` bytes, modulo 2^64, without those of an incomplete word. */

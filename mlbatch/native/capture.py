@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -13,6 +14,8 @@ from mlbatch.native.library import address, library
 NO_ROOM, CUT, TOO_LONG = range(3)
 # Room for frames of one walk.
 _ROOM = 1 << 14
+# Sets of fragments that `join` can tell from others.
+JOIN_SETS = 64
 
 
 class Found(NamedTuple):
@@ -73,6 +76,42 @@ class CaptureLoops:
         )
         parts, rest = found.tolist()
         return Found(datagrams[:, :whole], fragments[:, :parts], others[:rest])
+
+    def join(
+        self,
+        data: U8Array,
+        fragments: I64Array,
+        receive_ns: I64Array,
+        most_ns: int,
+        open_sets: Sequence[tuple[int, int, int]],
+    ) -> tuple[I64Array, I64Array]:
+        """Join fragments whose frames follow each other, moving them together within `data`.
+
+        fragments: columns (8, n) as `dissect` found them; receive_ns: (n,) rising. Sets that are
+        open, at most JOIN_SETS, or have other fragments before are left, as are those that took
+        longer than `most_ns`. Return columns of datagrams (5, n), and rows of what is left.
+        """
+        count = fragments.shape[1]
+        start, size = fragments[6:]
+        if bool(_is_outside(data, start, size).any()) or len(receive_ns) != count:
+            raise IndexError("fragments outside of their array")
+        fragments, receive_ns = map(np.ascontiguousarray, (fragments, receive_ns))
+        sets = np.zeros((JOIN_SETS, 3), np.int64)
+        sets[: len(open_sets)] = np.array(open_sets, np.int64).reshape(-1, 3)
+        datagrams = np.empty((5, count), np.int64)
+        rest = np.empty(count, np.int64)
+        left = np.empty(1, np.int64)
+        whole = self._library.mlbatch_join(
+            address(data),
+            count,
+            address(fragments),
+            address(receive_ns),
+            most_ns,
+            len(open_sets),
+            JOIN_SETS,
+            *map(address, (sets, datagrams, rest, left)),
+        )
+        return datagrams[:, :whole], rest[: int(left[0])]
 
     def copy_runs(
         self, source: U8Array, start: I64Array, size: I64Array, out: U8Array, at_byte: I64Array

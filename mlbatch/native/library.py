@@ -29,6 +29,7 @@ _FUNCTIONS: dict[str, tuple[type[Any], ...]] = {
     "mlbatch_single": (_ADDRESS, _WORD, _ADDRESS, *[_WORD] * 3, *[_ADDRESS] * 3),
     "mlbatch_walk": (_ADDRESS, *[_WORD] * 6, _ADDRESS, _ADDRESS),
     "mlbatch_dissect": (_ADDRESS, _WORD, _WORD, *[_ADDRESS] * 7),
+    "mlbatch_join": (_ADDRESS, _WORD, _ADDRESS, _ADDRESS, *[_WORD] * 3, *[_ADDRESS] * 4),
     "mlbatch_copy": (_WORD, *[_ADDRESS] * 5),
     "mlbatch_gather": (_WORD, _ADDRESS, _ADDRESS, _WORD, _ADDRESS, _WORD, _ADDRESS),
     "mlbatch_sums": (_WORD, _ADDRESS, _ADDRESS, _WORD, _ADDRESS),

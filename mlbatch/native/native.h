@@ -307,6 +307,10 @@ EXPORT int64_t mlbatch_dissect(const uint8_t *data, int64_t data_bytes, int64_t 
                                const int64_t *start, const int64_t *captured,
                                const int64_t *original, int64_t *datagrams, int64_t *fragments,
                                int64_t *others, int64_t *found);
+EXPORT int64_t mlbatch_join(uint8_t *data, int64_t count, const int64_t *fragments,
+                            const int64_t *receive_ns, int64_t most_ns, int64_t set_count,
+                            int64_t room, int64_t *sets, int64_t *datagrams, int64_t *rest,
+                            int64_t *rest_count);
 EXPORT void mlbatch_copy(int64_t runs, const uint8_t *source, const int64_t *source_at,
                          const int64_t *bytes, uint8_t *target, const int64_t *target_at);
 EXPORT void mlbatch_gather(int64_t packets, const uint8_t *data, const int64_t *start,

@@ -9,6 +9,7 @@ import random
 import struct
 import tempfile
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
 
@@ -24,10 +25,12 @@ from mlbatch.lidar.interface import Lidar
 from mlbatch.native.capture import CaptureLoops, Found
 from mlbatch.native.library import trouble
 from mlbatch.readers.byte_records import SLACK
-from mlbatch.readers.capture.frames import Addresses, Dissection, Frames, dissect
+from mlbatch.readers.capture.fragments import MAX_DATAGRAM_BYTES, Reassembler
+from mlbatch.readers.capture.frames import Addresses, Dissection, Fragments, Frames, dissect
 from mlbatch.ros.point_packets import CloudError, Layout, Points, layout_of, pack
 from mlbatch.ros.point_rows import Rows, take_rows
-from mlbatch.types import EXTRAS, Columns, RunInfo, SensorInfo, WindowColumns
+from mlbatch.types import EXTRAS, CaptureCounts, Columns, RunInfo, SensorInfo, WindowColumns
+from tests.builders.captures import udp_frame
 from tests.builders.engines import BOXES_M, Pair
 from tests.builders.headers import ouster_packets, same_as_numpy
 from tests.builders.ouster import OusterSpec
@@ -178,7 +181,11 @@ def _frame_seeds() -> Seeds:
     """Frames of datagrams, whole, in fragments and of other kinds, each behind its size."""
     rng = random.Random(5)
     every = [frame for _, frame in capture_records()]
-    return tuple(_framed(rng.choices(every, k=6)) for _ in range(20))
+    parts = [udp_frame(rng.randbytes(500), ident=ident, mtu=220) for ident in (7, 7, 8)]
+    together = [frame for datagram in parts for frame in datagram]
+    apart = [frame for three in zip(*parts, strict=True) for frame in three]
+    seeds = [_framed(rng.choices(every, k=6)) for _ in range(20)]
+    return (*seeds, *[_framed(together)] * 6, _framed([*apart, *together]))
 
 
 def _mutated_frames(rng: random.Random, seeds: Seeds) -> bytes:
@@ -213,10 +220,26 @@ def _dissect(data: bytes, folder: Path) -> None:
     original = captured + (captured % 7 == 3)
     link = np.full(len(sizes), _ETHERNET, np.int64)
     frames = Frames(start, captured, original, link, np.zeros(len(sizes), np.int64))
-    one = _content(len(data), dissect(padded, frames, Addresses()))
-    other = _content(len(data), dissect(padded, frames, Addresses(), _Exact(exact)))
-    if one != other:
+    found = dissect(padded, frames, Addresses())
+    compiled = dissect(padded, frames, Addresses(), _Exact(exact))
+    if _content(len(data), found) != _content(len(data), compiled):
         raise BrokenLaw("compiled loops find other datagrams than numpy")
+    if _joined(exact, found.fragments, None) != _joined(exact, found.fragments, CaptureLoops()):
+        raise BrokenLaw("compiled loops join other fragments than the rules")
+
+
+def _joined(data: U8Array, parts: Fragments, loops: CaptureLoops | None) -> object:
+    """Datagrams of fragments in an array that ends with the last of them; by the rules or loops."""
+    front = len(parts) * MAX_DATAGRAM_BYTES if loops is None else int(parts.size.sum())
+    whole = np.concatenate([np.zeros(front, np.uint8), data])
+    shifted = replace(parts, start=parts.start + front)
+    reassembler = Reassembler(CaptureCounts(), loops is not None, loops)
+    done = reassembler.push(whole, shifted, np.zeros(len(parts), np.int64))
+    reassembler.sets.finish()
+    ends = zip(done.start.tolist(), (done.start + done.size).tolist(), strict=True)
+    payloads = [whole[start:end].tobytes() for start, end in ends]
+    columns = (done.frame, done.source, done.port)
+    return payloads, [one.tolist() for one in columns], reassembler.counts.skipped
 
 
 def _content(size: int, found: Dissection) -> object:

@@ -13,8 +13,9 @@ Frames of dropped and never completed sets are counted `fragment_lost`; the fram
 datagram but the completing one are counted `fragment`, so that each datagram is one frame.
 
 `SetTable` applies the rules to one fragment at a time. `Reassembler` treats the usual case many at
-once: all fragments of a datagram are in one buffer, in order, and no set of theirs is open. A chain
-is a run of fragments of one set in which each continues the one before.
+once: all fragments of a datagram are in one buffer, in order, and no set of theirs is open. Where
+their frames also follow each other, compiled loops join them in place. A chain is a run of
+fragments of one set in which each continues the one before.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ from typing import NamedTuple
 import numpy as np
 
 from mlbatch.arrays import BoolArray, I64Array, U8Array
-from mlbatch.native.capture import CaptureLoops
+from mlbatch.native.capture import JOIN_SETS, CaptureLoops
 from mlbatch.readers.byte_records import copy_runs, records
 from mlbatch.readers.capture.frames import UDP, Datagrams, Fragments, in_order
 from mlbatch.types import CaptureCounts
@@ -36,6 +37,8 @@ MAX_SETS = 2048
 MAX_DATAGRAM_BYTES = 65535
 MAX_AGE_NS = NS_PER_S
 _UDP_BYTES = 8
+# So few fragments are faster one at a time.
+_FEW = 64
 
 
 @dataclass(slots=True)
@@ -87,6 +90,10 @@ class SetTable:
 
     def __contains__(self, key: tuple[int, int, int]) -> bool:
         return key in self._sets
+
+    def keys(self) -> list[tuple[int, int, int]]:
+        """Source, destination and identification of the open sets."""
+        return list(self._sets)
 
     def expire(self, now_ns: int) -> None:
         """Drop the sets that are more than a second away from `now_ns`."""
@@ -192,9 +199,22 @@ class Reassembler:
         host_ns: (n,) int64, receive time of each fragment. The caller leaves enough room: the
         fragments' bytes and `sets.held_bytes`, or MAX_DATAGRAM_BYTES for each fragment.
         """
-        every = np.arange(len(fragments))
         if not self.together or not _independent(fragments, host_ns):
-            return self._one_by_one(data, fragments, host_ns, every, 0)
+            return self._one_by_one(data, fragments, host_ns, _every(fragments), 0)
+        if self.loops is None or len(self.sets) >= JOIN_SETS:
+            return self._by_chains(data, fragments, host_ns)
+        columns = np.array([getattr(fragments, name) for name in Fragments.__slots__], np.int64)
+        joined, rest = self.loops.join(data, columns, host_ns, MAX_AGE_NS, self.sets.keys())
+        self.counts.skip("fragment", len(fragments) - len(rest) - joined.shape[1])
+        if len(rest) < _FEW:
+            others = self._one_by_one(data, fragments, host_ns, rest, 0)
+        else:
+            others = self._by_chains(data, fragments.take(rest), host_ns[rest])
+        self.sets.expire(int(host_ns[-1]))
+        return in_order(Datagrams(*joined), others)
+
+    def _by_chains(self, data: U8Array, fragments: Fragments, host_ns: I64Array) -> Datagrams:
+        every = _every(fragments)
         chains = _find_chains(data, fragments, host_ns)
         if len(self.sets) + len(chains.start) > MAX_SETS:
             return self._one_by_one(data, fragments, host_ns, every, 0)
@@ -247,6 +267,10 @@ class Reassembler:
             done.append((int(fragments.frame[row]), end + 8, length - 8, source, port))
             end += max(at + len(part) for at, part in parts.items())
         return Datagrams(*np.array(done, np.int64).reshape(-1, 5).T)
+
+
+def _every(fragments: Fragments) -> I64Array:
+    return np.arange(len(fragments))
 
 
 def _independent(fragments: Fragments, host_ns: I64Array) -> bool:

@@ -134,6 +134,10 @@ class Fragments:
     def __len__(self) -> int:
         return len(self.frame)
 
+    def take(self, rows: I64Array) -> Fragments:
+        """The fragments at `rows`."""
+        return Fragments(*(getattr(self, name)[rows] for name in Fragments.__slots__))
+
 
 @dataclass(slots=True)
 class Dissection:

@@ -5,13 +5,18 @@ from __future__ import annotations
 import random
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from unittest import mock
 
+import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from mlbatch.native.capture import CaptureLoops
+from mlbatch.native.library import trouble
 from mlbatch.readers.capture import fragments as _fragments
 from tests.builders.captures import ipv4_packet, link_frame, udp_frame, write_pcap
+from tests.builders.engines import ENGINES, needs_native
 from tests.builders.reading import Seen, open_capture, read
 
 SECOND_NS = 1_000_000_000
@@ -29,30 +34,31 @@ def fragments(seed: int, ident: int = 1, src: str = "10.0.0.1", size: int = 1500
     return udp_frame(payload(seed, size), src, ident=ident, mtu=MTU)
 
 
-def both_ways(
+def every_way(
     records: Records, buffer_bytes: int | None = None
 ) -> tuple[list[Seen], dict[str, int]]:
-    """Packets and skipped frames, which must be the same with and without the fast way."""
+    """Packets and skipped frames, which must be the same by the rules and in all fast ways."""
     with TemporaryDirectory() as folder:
         path = write_pcap(Path(folder) / "a", records)
-        fast = open_capture(path, buffer_bytes=buffer_bytes)
         slow = open_capture(path, together=False)
-        seen = read(fast)
-        assert seen == read(slow)
-        assert fast.counts == slow.counts
-        assert fast.streams.streams == slow.streams.streams
-        return seen, fast.counts.skipped
+        seen = read(slow)
+        for engine in ("numpy",) if trouble() else ENGINES:
+            fast = open_capture(path, buffer_bytes=buffer_bytes, engine=engine)
+            assert read(fast) == seen
+            assert fast.counts == slow.counts
+            assert fast.streams.streams == slow.streams.streams
+        return seen, slow.counts.skipped
 
 
 def found(frames: list[bytes]) -> tuple[list[bytes], dict[str, int]]:
     """Payloads and skipped frames of frames received 1 us apart."""
-    seen, skipped = both_ways([(i * 1000, frame) for i, frame in enumerate(frames)])
+    seen, skipped = every_way([(i * 1000, frame) for i, frame in enumerate(frames)])
     return [one.payload for one in seen], skipped
 
 
 def test_the_completing_fragment_gives_the_time() -> None:
     first, middle, last = fragments(1)
-    seen, skipped = both_ways([(10, first), (30, last), (70, middle)])
+    seen, skipped = every_way([(10, first), (30, last), (70, middle)])
     assert seen == [Seen(70, "10.0.0.1 > port 7502", payload(1))]
     assert skipped == {"fragment": 2}
 
@@ -102,14 +108,14 @@ def test_a_lost_fragment_loses_its_datagram_only() -> None:
 @pytest.mark.parametrize(("age_ns", "whole"), [(SECOND_NS, True), (SECOND_NS + 1, False)])
 def test_sets_older_than_a_second_are_dropped(age_ns: int, whole: bool) -> None:
     first, middle, last = fragments(1)
-    seen, skipped = both_ways([(5, first), (5 + age_ns, middle), (5 + age_ns, last)])
+    seen, skipped = every_way([(5, first), (5 + age_ns, middle), (5 + age_ns, last)])
     assert len(seen) == whole
     assert skipped == ({"fragment": 2} if whole else {"fragment_lost": 3})
 
 
 def test_age_counts_when_the_clock_steps_back() -> None:
     first, middle, last = fragments(1)
-    seen, skipped = both_ways([(5 * SECOND_NS, first), (SECOND_NS, middle), (SECOND_NS, last)])
+    seen, skipped = every_way([(5 * SECOND_NS, first), (SECOND_NS, middle), (SECOND_NS, last)])
     assert (seen, skipped) == ([], {"fragment_lost": 3})
 
 
@@ -181,7 +187,7 @@ def test_large_held_sets_do_not_overflow_the_arena() -> None:
     # 60 datagrams of 60 kB each wait for their last fragments, which come all at once.
     sets = [udp_frame(payload(i, 60_000), ident=i, mtu=9000) for i in range(60)]
     frames = [f for one in sets for f in one[:-1]] + [one[-1] for one in sets]
-    seen, skipped = both_ways([(0, f) for f in frames], buffer_bytes=50_000)
+    seen, skipped = every_way([(0, f) for f in frames], buffer_bytes=50_000)
     assert [one.payload for one in seen] == [payload(i, 60_000) for i in range(60)]
     assert skipped == {"fragment": 6 * 60}
 
@@ -217,6 +223,41 @@ def feed(seed: int) -> Records:
 @given(
     seed=st.integers(0, 2**32),
     buffer_bytes=st.sampled_from([100, 1000, 2000, 5000, 20_000, 100_000]),
+    few=st.sampled_from([1, 64]),
 )
-def test_the_fast_way_and_any_buffer_give_what_the_rules_give(seed: int, buffer_bytes: int) -> None:
-    both_ways(feed(seed), buffer_bytes)
+def test_the_fast_ways_and_any_buffer_give_what_the_rules_give(
+    seed: int, buffer_bytes: int, few: int
+) -> None:
+    with mock.patch.object(_fragments, "_FEW", few):
+        every_way(feed(seed), buffer_bytes)
+
+
+@needs_native
+def test_frames_that_follow_each_other_are_joined_in_place() -> None:
+    # Sets 7, 8 and 9, of which 9 is open; between frames 2 and 4 is one without a fragment.
+    first = [(0, 0, 8), (1, 8, 8), (2, 16, 4)]
+    parts = [(7, frame, at, size, frame != 2) for frame, at, size in first]
+    parts += [(8, 4, 0, 10, True), (8, 5, 10, 6, False), (9, 8, 16, 8, False)]
+    data = np.random.default_rng(1).integers(0, 256, 240, np.uint8)
+    start = np.array([10, 50, 80, 120, 150, 200])
+    # Source and destination port, length, checksum.
+    data[10:18] = list(bytes.fromhex("00011d4e00140000"))
+    data[120:128] = list(bytes.fromhex("00021d4f000c0000"))
+    before = data.copy()
+    ident, frame, offset, size, more = (np.array(column) for column in zip(*parts, strict=True))
+    fragments = np.array([frame, 0 * frame + 3, 0 * frame + 4, ident, offset, more, start, size])
+    times = np.arange(len(parts))
+    datagrams, rest = CaptureLoops().join(data, fragments, times, SECOND_NS, [(3, 4, 9)])
+    assert datagrams.T.tolist() == [[2, 18, 12, 3, 7502], [5, 128, 4, 3, 7503]]
+    assert rest.tolist() == [5]
+    assert data[18:30].tolist() == [*before[50:58].tolist(), *before[80:84].tolist()]
+    assert data[128:132].tolist() == [*before[128:130].tolist(), *before[150:152].tolist()]
+    assert data[200:].tolist() == before[200:].tolist()
+
+
+@needs_native
+@pytest.mark.parametrize(("start", "size"), [(-1, 8), (93, 8), (0, -1), (2**62, 8), (0, 2**62)])
+def test_fragments_beyond_the_buffer_are_refused(start: int, size: int) -> None:
+    fragments = np.array([[0], [1], [2], [3], [0], [0], [start], [size]])
+    with pytest.raises(IndexError):
+        CaptureLoops().join(np.zeros(100, np.uint8), fragments, np.zeros(1, np.int64), 1, [])
