@@ -280,8 +280,23 @@ def _by_jobs(*options: str) -> tuple[Conversion, ...]:
     return one, two
 
 
+def _by_windows() -> tuple[Conversion, ...]:
+    """Dry runs with other windows and layouts than ten dense scans a second."""
+    plain = Conversion("10 Hz", "dual-4")
+    others = {
+        "100 Hz": ("--rate", "100"),
+        "10 slices": ("--slices", "10"),
+        "organized": ("--layout", "organized"),
+    }
+    return plain, *(
+        replace(plain, name=name, options=options, base=plain.name)
+        for name, options in others.items()
+    )
+
+
 CASES: Final = (
     Case("dual-4", ("dual-4", "dual-4-fragments")),
+    Case("dual-4-windows", ("dual-4",), variants=_by_windows()),
     Case("dual-12", ("dual-12", "dual-12-fragments")),
     Case("eight-4", ("eight-4",)),
     Case("three-vlp16", ("three-vlp16",)),
