@@ -59,7 +59,8 @@ class PacketArena:
         """Replace the array by a larger one, in which all from `oldest` on is contiguous."""
         live = max(self._next - oldest, 0)
         capacity = max(2 * self.capacity, live + 2 * count)
-        new = np.zeros(capacity + _SPARE, np.uint8)
+        # To be filled before it is read: zeros would be written by the processor, of MB.
+        new = np.empty(capacity + _SPARE, np.uint8)
         if live:
             begin = (oldest - self.origin) % self.capacity
             first = min(live, self.capacity - begin)

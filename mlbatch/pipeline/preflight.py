@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import shutil
 from pathlib import Path
 
 from mlbatch.errors import ExportError
@@ -12,6 +11,7 @@ from mlbatch.rig.rig import read_rig
 from mlbatch.writers import (
     check_free_space,
     check_name,
+    free_bytes,
     is_report,
     is_taken,
     old_path,
@@ -78,24 +78,28 @@ def check_disk(job: Job, output: Path) -> str:
     recorded = sum(path.stat().st_size for path in job.recordings if path.is_file())
     if job.shard is not None:
         recorded //= job.shard.count
+    # As a rule there is space for all, and the rig need not be read here.
+    if free_bytes(output) >= recorded or _is_limited_by_rig(job):
+        return ""
     check_free_space(output, recorded // LEAST_OUTPUT)
-    free = shutil.disk_usage(output.parent).free
-    if free < recorded:
-        return (
-            f"disk: {output}: {free // _BYTES_PER_MB} MB are free for a recording of "
-            f"{recorded // _BYTES_PER_MB} MB, which may not be enough"
-        )
-    return ""
+    return (
+        f"disk: {output}: {free_bytes(output) // _BYTES_PER_MB} MB are free for a recording of "
+        f"{recorded // _BYTES_PER_MB} MB, which may not be enough"
+    )
 
 
 def _is_limited(job: Job) -> bool:
     """True if the options can make the output arbitrarily small."""
     selection = job.selection
-    ranges_m = [job.max_range_m]
-    if selection.rig is not None:
-        ranges_m += [sensor.max_range_m or math.inf for sensor in read_rig(selection.rig).sensors]
     in_time = job.start is not None or job.end is not None
-    return in_time or min(ranges_m) < math.inf or bool(selection.only or selection.ignore)
+    return in_time or job.max_range_m < math.inf or bool(selection.only or selection.ignore)
+
+
+def _is_limited_by_rig(job: Job) -> bool:
+    """True if the rig can make it arbitrarily small."""
+    path = job.selection.rig
+    sensors = () if path is None else read_rig(path).sensors
+    return any((sensor.max_range_m or math.inf) < math.inf for sensor in sensors)
 
 
 def check_report(job: Job, path: Path | None, output: Path | None, name: str) -> None:

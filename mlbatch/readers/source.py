@@ -226,7 +226,7 @@ class Window:
 
     def _allocate(self, count: int) -> None:
         if self._arena is None:
-            self.data = np.zeros(count, np.uint8)
+            self.data = np.empty(count, np.uint8)
         else:
             self.data, self.arena_place = self._arena.reserve_for_reading(count)
 

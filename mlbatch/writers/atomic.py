@@ -202,14 +202,19 @@ def side_path(target: Path, name: str) -> Path:
     return target.with_name(f"{target.name}.{name}")
 
 
+def free_bytes(target: Path) -> int:
+    """Free space of the disk of an output."""
+    with export_errors(target):
+        return shutil.disk_usage(target.parent).free
+
+
 def check_free_space(target: Path, needed_bytes: int) -> None:
     """Refuse an output if its disk has less free space than `needed_bytes`."""
-    with export_errors(target):
-        free_bytes = shutil.disk_usage(target.parent).free
-    if free_bytes < needed_bytes:
+    free = free_bytes(target)
+    if free < needed_bytes:
         raise ExportError(
             f"{target}: expected about {needed_bytes // _BYTES_PER_MB} MB of free disk, found "
-            f"{free_bytes // _BYTES_PER_MB} MB; free space or choose another output"
+            f"{free // _BYTES_PER_MB} MB; free space or choose another output"
         )
 
 

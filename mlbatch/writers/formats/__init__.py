@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import importlib
 import pkgutil
+import sys
 from functools import lru_cache
 from typing import TYPE_CHECKING, cast
 
@@ -33,9 +34,14 @@ def other_names() -> tuple[str, ...]:
     return entry_points.names(entry_points.WRITERS, built_in_names())
 
 
+def _is_built_in(name: str) -> bool:
+    """Return whether it is one of the formats here; for a loaded one the folder is not read."""
+    return f"{__name__}.{name}" in sys.modules or name in built_in_names()
+
+
 def is_format(name: str) -> bool:
     """Return whether there is a format of this name."""
-    return name in built_in_names() or (name != "" and name in format_names())
+    return _is_built_in(name) or (name != "" and name in format_names())
 
 
 def format_of_files(suffix: str) -> str | None:
@@ -55,7 +61,7 @@ def _file_suffixes(name: str) -> tuple[str, ...]:
 
 def format_module(name: str) -> WriterModule:
     """Return the module of one of the formats."""
-    if name in built_in_names():
+    if _is_built_in(name):
         return cast("WriterModule", importlib.import_module(f"{__name__}.{name}"))
     module = cast("WriterModule", entry_points.load(entry_points.WRITERS, name))
     if name != module.FORMAT:
