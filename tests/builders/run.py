@@ -17,7 +17,7 @@ import numpy.typing as npt
 
 from mlbatch import readers
 from mlbatch.arrays import BoolArray, F32Array, I64Array, U8Array, U16Array, U32Array
-from mlbatch.cli import main
+from mlbatch.cli import app, main
 from mlbatch.discovery.discover import SensorSelection
 from mlbatch.pipeline.conversion import Conversion
 from mlbatch.pipeline.job import Job
@@ -37,6 +37,7 @@ from mlbatch.types import (
     Summary,
 )
 from mlbatch.writers import Checkpoint, ScanJob, ScanWriter, WriterOptions, extras, open_writer
+from tests.builders.parser import parser
 
 ROOT = Path(__file__).resolve().parents[2]
 RECORDINGS = ROOT / ".." / "shared" / "recordings"
@@ -70,7 +71,11 @@ def command(*words: str | Path) -> Told:
     sys.argv = ["mlbatch", *map(str, words)]
     code: object = 0
     try:
-        with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+        with (
+            patch.object(app, "command_line", parser),
+            contextlib.redirect_stdout(out),
+            contextlib.redirect_stderr(err),
+        ):
             main()
     except SystemExit as leave:
         code = leave.code

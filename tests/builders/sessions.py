@@ -16,11 +16,12 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from mlbatch.cli import main
+from mlbatch.cli import app, main
 from mlbatch.pipeline import resume, state_file
 from mlbatch.writers import atomic
 from tests.builders.captures import udp_frame, write_pcap
 from tests.builders.ouster import OusterSpec, encode_frame, imu_packet, metadata_json
+from tests.builders.parser import parser
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 FIXTURE = REPOSITORY / "fixtures" / "two_lidars"
@@ -137,6 +138,7 @@ class Shell:
         alone = arguments[0] if len(arguments) == 1 else ""
         words = shlex.split(alone) if isinstance(alone, str) and alone else map(str, arguments)
         self.monkeypatch.setattr(sys, "argv", ["mlbatch", *words])
+        self.monkeypatch.setattr(app, "command_line", parser)
         self.capsys.readouterr()
         with pytest.raises(SystemExit) as end:
             main()

@@ -26,11 +26,13 @@ import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from unittest.mock import patch
 
 import pytest
 
-from mlbatch.cli import main
+from mlbatch.cli import app, main
 from mlbatch.native.library import trouble
+from tests.builders.parser import parser
 from tests.golden.digest_outputs import Digests
 from tests.golden.digest_recordings import (
     CONTAINERS,
@@ -292,7 +294,11 @@ def command(*words: str) -> Said:
     sys.argv = ["mlbatch", *words]
     code: object = 0
     try:
-        with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+        with (
+            patch.object(app, "command_line", parser),
+            contextlib.redirect_stdout(out),
+            contextlib.redirect_stderr(err),
+        ):
             main()
     except SystemExit as leave:
         code = leave.code
