@@ -31,7 +31,7 @@ SOURCES := $(wildcard mlbatch/native/*.[ch])
 CONVERT := $(BIN)/mlbatch convert $(RIG)/two_lidars.pcap --rig $(RIG)/rig.yaml --overwrite
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test coverage test-quick test-lowest test-consumers lint docs bench odometry odometry-quick \
+.PHONY: help demo test suite coverage test-quick test-lowest test-consumers lint docs bench odometry odometry-quick \
 	casestudy fuzz fuzz-sanitized clean
 
 help:
@@ -44,17 +44,19 @@ demo: $(VENV)/dev.stamp
 	$(BIN)/python docs/picture.py demo/scans demo/two_lidars.png
 	@$(BIN)/python docs/demo.py demo
 
-test: lint
-	$(BIN)/python -m pytest -n 2
+test: lint suite
+
+suite: $(VENV)/dev.stamp
+	$(BIN)/python -m pytest -n 2 --dist worksteal
 
 coverage: $(VENV)/dev.stamp
-	$(BIN)/python -m pytest -n 2 --cov --cov-branch --cov-report=term:skip-covered --cov-fail-under=95
+	$(BIN)/python -m pytest -n 2 --dist worksteal --cov --cov-branch --cov-report=term:skip-covered --cov-fail-under=95
 
 test-quick: $(VENV)/dev.stamp
-	$(BIN)/python -m pytest -n 2 -m 'not slow and not long'
+	$(BIN)/python -m pytest -n 2 --dist worksteal -m 'not slow and not long'
 
 test-lowest: $(LOWEST)/dev.stamp
-	$(LOWEST)/bin/python -m pytest -n 2 -m 'not slow and not long'
+	$(LOWEST)/bin/python -m pytest -n 2 --dist worksteal -m 'not slow and not long'
 
 # PCL and CloudCompare: apt-get install pcl-tools cloudcompare; the reader of JavaScript: node, npm.
 test-consumers: $(VENV)/dev.stamp
