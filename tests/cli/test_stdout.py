@@ -20,8 +20,8 @@ RIG = FIXTURE / "rig.yaml"
 def _paths() -> list[tuple[str, str, bool]]:
     """Command, option and whether it is an argument, of all parameters that are paths."""
     found: list[tuple[str, str, bool]] = []
+    group = typer.main.get_command(command_line())
     for command in COMMANDS:
-        group = typer.main.get_command(command_line())
         for param in group.commands[command].params:  # type: ignore[attr-defined]
             is_argument = param.param_type_name == "argument"
             if param.type.name == "path" and (command, param.name) not in PRINTABLE:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import re
+from functools import cache
 
 import pytest
 
@@ -13,6 +14,7 @@ PAGE = (ROOT / "docs" / "reference" / "errors.md").read_text(encoding="utf-8")
 MESSAGES = re.findall(r"^> `(.+)`$", PAGE, re.MULTILINE)
 
 
+@cache
 def _texts() -> set[str]:
     """All texts of the package; a value in one is {}."""
     found = set()
@@ -28,12 +30,9 @@ def _texts() -> set[str]:
     return found
 
 
-TEXTS = _texts()
-
-
 @pytest.mark.parametrize("message", MESSAGES)
 def test_a_message_of_the_page_is_one_of_the_package(message: str) -> None:
-    assert any(message in text for text in TEXTS)
+    assert any(message in text for text in _texts())
 
 
 def test_every_error_has_its_message_and_remedy() -> None:

@@ -9,7 +9,7 @@ import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cache, lru_cache
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -24,7 +24,11 @@ class Module:
 
     path: Path
     name: str
-    tree: ast.Module
+
+    @property
+    def tree(self) -> ast.Module:
+        """What the file says."""
+        return _parsed(self.path)
 
     @property
     def top(self) -> str:
@@ -58,7 +62,12 @@ def _module(path: Path) -> Module:
     parts = list(path.relative_to(PACKAGE).with_suffix("").parts)
     if parts[-1] == "__init__":
         parts.pop()
-    return Module(path, ".".join(parts), ast.parse(path.read_text(encoding="utf-8")))
+    return Module(path, ".".join(parts))
+
+
+@cache
+def _parsed(path: Path) -> ast.Module:
+    return ast.parse(path.read_text(encoding="utf-8"))
 
 
 def imports(module: Module, names: frozenset[str]) -> Iterator[Import]:

@@ -12,6 +12,7 @@ import hashlib
 import json
 from dataclasses import dataclass
 from fractions import Fraction
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -28,12 +29,17 @@ from tests.builders.seen_points import Expected, Points, pair_types, repeated
 
 PCAP = FOLDER / "four_makers.pcap"
 RIG = FOLDER / "rig.yaml"
-SENSORS = [seen()[place.name] for place in PLACES]
 NAMES = [place.name for place in PLACES]
 ROOF = PLACES.index(VELODYNE)
 # Half a step of the azimuth, 0.01 degrees, is 8.7e-5 m per metre: as much only along the normal.
 OFF_PER_M = 1e-4
 FLOAT32_AT_20_M = 1e-5
+
+
+@cache
+def sensors() -> list[Seen]:
+    """What each sent, in the order of the rig."""
+    return [seen()[place.name] for place in PLACES]
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,7 +84,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Run:
 def columns_of(window: Window) -> tuple[I64Array, I64Array]:
     """Sensor of each column of a window, and its number among the sensor's."""
     sensor, packet, column = np.array(window.columns, np.int64).T
-    per_packet = np.array([sight.columns_per_packet for sight in SENSORS])
+    per_packet = np.array([sight.columns_per_packet for sight in sensors()])
     return sensor, packet * per_packet[sensor] + column
 
 
@@ -91,7 +97,7 @@ def check_windows(converted: Run) -> None:
         for key in ("index", "slice", "start_ns", "end_ns", "complete"):
             assert scan[key] == getattr(window, key), key
         stamps = np.choose(
-            sensor, [sight.stamp_ns[column % len(sight.stamp_ns)] for sight in SENSORS]
+            sensor, [sight.stamp_ns[column % len(sight.stamp_ns)] for sight in sensors()]
         )
         assert np.array_equal(scan["column_lidar_id"], sensor)
         assert np.array_equal(scan["column_stamp_ns"], stamps)
@@ -99,7 +105,7 @@ def check_windows(converted: Run) -> None:
 
 def check_points(converted: Run, *, keep_repeated: bool = False, are_turned: bool = True) -> None:
     """What each point is, when it was measured, where it lies, and the order of points."""
-    expected = Expected(SENSORS, keep_repeated=keep_repeated)
+    expected = Expected(sensors(), keep_repeated=keep_repeated)
     for path, window in zip(scan_files(converted.folder), converted.outcome.windows, strict=True):
         cloud = Cloud.of(path)
         expected_points = expected.points(*columns_of(window))
@@ -124,7 +130,7 @@ def check_places(cloud: Cloud) -> None:
     """Every point is finite, lies on a surface, and as far away as measured, but for the lens."""
     assert np.isfinite(cloud.xyz).all()
     assert np.isfinite(cloud.intensity).all()
-    for number, (place, sight) in enumerate(zip(PLACES, SENSORS, strict=True)):
+    for number, (place, sight) in enumerate(zip(PLACES, sensors(), strict=True)):
         own = cloud.of_sensor(number)
         xyz_m = own.xyz.astype(np.float64)
         range_m = own.range_m.astype(np.float64)
@@ -178,7 +184,7 @@ def test_without_the_motion_of_the_rotor_points_are_off(whole: Run, tmp_path: Pa
 
 
 def test_the_hour_passes_within_the_recording(whole: Run) -> None:
-    for sight in SENSORS:
+    for sight in sensors():
         assert sight.stamp_ns[0] < HOUR_NS < sight.stamp_ns[-1]
     stamps = Cloud.of_all(whole.folder).column_stamp_ns
     assert (np.diff(stamps) >= 0).all()
@@ -190,7 +196,7 @@ def test_returns_that_are_sent_twice_are_counted(whole: Run, tmp_path: Path) -> 
     check_points(twice, keep_repeated=True)
     check_places(Cloud.of_all(twice.folder))
     for converted, is_kept in ((whole, False), (twice, True)):
-        for sensor, sight in zip(converted.report["sensors"], SENSORS, strict=True):
+        for sensor, sight in zip(converted.report["sensors"], sensors(), strict=True):
             again = int(repeated(sight.counts).sum())
             points = sensor["points"]
             assert points["repeated"] == (0 if is_kept else again)
@@ -200,13 +206,13 @@ def test_returns_that_are_sent_twice_are_counted(whole: Run, tmp_path: Path) -> 
             assert points["written"] == left
             assert points["range"] == points["box"] == 0
     # Pairs that differ are there as well.
-    roof = SENSORS[ROOF].counts
+    roof = sensors()[ROOF].counts
     assert 500 < np.count_nonzero(roof[..., 0] != roof[..., 1]) < roof.size / 4
 
 
 def test_returns_have_their_types(tmp_path: Path) -> None:
     grid = organized(tmp_path)
-    roof = SENSORS[ROOF]
+    roof = sensors()[ROOF]
     types = grid["return_type"][grid["column_lidar_id"] == ROOF]
     expected_points = pair_types(roof.counts, roof.level)
     expected_points[roof.counts == 0] = 0
@@ -234,10 +240,10 @@ def test_organized_scans_hold_what_was_sent(
     whole: Run, keep_repeated: bool, tmp_path: Path
 ) -> None:
     grid = organized(tmp_path, *(["--keep-repeated"] if keep_repeated else []))
-    widest = max(sight.channels * sight.returns for sight in SENSORS)
-    assert grid["range_m"].shape == (sum(len(sight.stamp_ns) for sight in SENSORS), widest)
+    widest = max(sight.channels * sight.returns for sight in sensors())
+    assert grid["range_m"].shape == (sum(len(sight.stamp_ns) for sight in sensors()), widest)
     filled: BoolArray = ~np.isnan(grid["range_m"])
-    for number, sight in enumerate(SENSORS):
+    for number, sight in enumerate(sensors()):
         rows = grid["column_lidar_id"] == number
         check_slots({key: value[rows] for key, value in grid.items()}, sight, keep_repeated)
     for key, empty in (("xyz", np.nan), ("intensity", np.nan), ("time_ns", 0), ("ring", 0)):
@@ -276,7 +282,7 @@ def test_ledgers_balance(whole: Run) -> None:
     assert report["capture"]["frames"] == report["capture"]["datagrams"] + sum(
         report["capture"]["skipped"].values()
     )
-    for sensor, sight in zip(report["sensors"], SENSORS, strict=True):
+    for sensor, sight in zip(report["sensors"], sensors(), strict=True):
         packets = sensor["packets"]
         columns = sensor["columns"]
         points = sensor["points"]
