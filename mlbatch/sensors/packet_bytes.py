@@ -18,6 +18,10 @@ US_PER_MINUTE = 60_000_000
 _TICKS_PER_REVOLUTION = 36000
 _MAX_LOST_ANGLE = _TICKS_PER_REVOLUTION // 2
 Order = Literal["<", ">"]
+_ORDERS: tuple[Order, ...] = ("<", ">")
+_WORDS = {
+    (width, order): np.dtype(f"{order}u{width}") for width in (1, 2, 4, 8) for order in _ORDERS
+}
 
 
 def payload_rows(size: int, sample: U8Array) -> U8Array | None:
@@ -30,8 +34,12 @@ def payload_rows(size: int, sample: U8Array) -> U8Array | None:
 
 def number(packets: U8Array, at: int, width: int, order: Order = "<") -> I64Array:
     """(k,) unsigned numbers of `width` bytes at byte `at`, which must be within the payloads."""
+    part = packets[:, at : at + width]
+    word = _WORDS.get((width, order))
+    if word is not None:
+        return np.ascontiguousarray(part).view(word)[:, 0].astype(np.int64)
     shifts = np.arange(width) if order == "<" else np.arange(width)[::-1]
-    shifted: I64Array = packets[:, at : at + width].astype(np.int64) << (8 * shifts)
+    shifted: I64Array = part.astype(np.int64) << (8 * shifts)
     return np.asarray(shifted.sum(axis=1), np.int64)
 
 
@@ -61,9 +69,9 @@ def most_common(values: I64Array) -> int:
 
 def block_azimuths(packets: U8Array, begin: int, stride: int, count: int, order: Order) -> I64Array:
     """(k, count) azimuths, 0.01 degree, at bytes 2 and 3 of equal blocks."""
-    return np.stack(
-        [number(packets, begin + stride * block + 2, 2, order) for block in range(count)], axis=1
-    )
+    at = begin + 2 + stride * np.arange(count)[:, None] + np.arange(2)
+    pairs: U8Array = packets[:, at]
+    return np.ascontiguousarray(pairs).view(_WORDS[2, order])[:, :, 0].astype(np.int64)
 
 
 def in_pairs(azimuth: I64Array) -> bool:
