@@ -9,6 +9,7 @@ from __future__ import annotations
 import ipaddress
 import struct
 from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Protocol
 
@@ -34,6 +35,11 @@ _UDP_PROTOCOL = 17
 _COMMIT_ROWS = 5000
 
 
+@cache
+def _packed(address: str) -> bytes:
+    return ipaddress.IPv4Address(address).packed
+
+
 class PcapFile:
     """A capture with times in ns; a datagram is one frame of any length, without checksum."""
 
@@ -45,7 +51,7 @@ class PcapFile:
 
     def packet(self, host_ns: int, address: str, port: int, payload: bytes) -> None:
         """Append a datagram."""
-        sender = ipaddress.IPv4Address(address).packed
+        sender = _packed(address)
         size = _IP.size + _UDP.size + len(payload)
         self._number = (self._number + 1) % 2**16
         head = _IP.pack(0x45, 0, size, self._number, 0, 64, _UDP_PROTOCOL, 0, sender, _RECEIVER)
