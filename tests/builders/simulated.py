@@ -106,17 +106,25 @@ def read_tum(path: Path) -> tuple[I64Array, F64Array]:
 def at_true_poses(points_m: F64Array, time_ns: F64Array, truth: Path) -> F64Array:
     """Points (n, 3) of the body frame in the world; time_ns: (n,) true time of each."""
     stamps, rows = read_tum(truth)
+    # (7, m): coordinates of points are added up fast where each is contiguous.
+    poses = np.ascontiguousarray(rows.T)
     after = np.clip(np.searchsorted(stamps, time_ns), 1, len(stamps) - 1)
-    share = ((time_ns - stamps[after - 1]) / (stamps[after] - stamps[after - 1]))[:, None]
-    first, second = rows[after - 1], rows[after].copy()
-    second[:, 3:] *= np.sign((first[:, 3:] * second[:, 3:]).sum(axis=1))[:, None]
-    pose = first * (1 - share) + second * share
-    vector = pose[:, 3:6] / np.linalg.norm(pose[:, 3:], axis=1)[:, None]
-    scalar = (pose[:, 6] / np.linalg.norm(pose[:, 3:], axis=1))[:, None]
-    twice = 2 * np.cross(vector, points_m)
-    turned: F64Array = points_m + scalar * twice + np.cross(vector, twice)
-    moved: F64Array = turned + pose[:, :3]
-    return moved
+    share = (time_ns - stamps[after - 1]) / (stamps[after] - stamps[after - 1])
+    first, second = poses.take(after - 1, axis=1), poses.take(after, axis=1)
+    second[3:] *= np.sign((first[3:] * second[3:]).sum(axis=0))
+    pose = first + (second - first) * share
+    quaternion = pose[3:] / np.sqrt((pose[3:] ** 2).sum(axis=0))
+    vector, scalar = quaternion[:3], quaternion[3]
+    points = np.ascontiguousarray(points_m.T)
+    twice = 2 * _cross(vector, points)
+    moved: F64Array = points + scalar * twice + _cross(vector, twice) + pose[:3]
+    return np.ascontiguousarray(moved.T)
+
+
+def _cross(one: F64Array, other: F64Array) -> F64Array:
+    """Cross products of vectors (3, n)."""
+    (x, y, z), (u, v, w) = one, other
+    return np.stack([y * w - z * v, z * u - x * w, x * v - y * u])
 
 
 def distance_to_scene(scene: Scene, points_m: F64Array, time_s: F64Array) -> F64Array:
@@ -159,12 +167,13 @@ def residuals(recorded: Recorded, scans: Sequence[Scan]) -> F64Array:
 
 def _to_box(kind: Boxes, row: int, points_m: F64Array, time_s: F64Array) -> F64Array:
     since = time_s % kind.repeat_s[row] if np.isfinite(kind.repeat_s[row]) else time_s
-    local = points_m - kind.centre_m[row] - since[:, None] * kind.velocity_mps[row]
+    centre, velocity = kind.centre_m[row], kind.velocity_mps[row]
+    x, y, z = (points_m[:, axis] - centre[axis] - since * velocity[axis] for axis in range(3))
     cosine, sine = np.cos(kind.yaw_rad[row]), np.sin(kind.yaw_rad[row])
-    turned = local @ np.array([[cosine, -sine, 0], [sine, cosine, 0], [0, 0, 1]])
-    past = np.abs(turned) - kind.size_m[row] / 2
-    outside = np.linalg.norm(np.maximum(past, 0), axis=1)
-    return np.asarray(np.where(outside > 0, outside, -past.max(axis=1)))
+    local = (cosine * x + sine * y, cosine * y - sine * x, z)
+    past = [np.abs(one) - size / 2 for one, size in zip(local, kind.size_m[row], strict=True)]
+    outside = np.sqrt(sum(np.maximum(one, 0) ** 2 for one in past))
+    return np.asarray(np.where(outside > 0, outside, -np.maximum.reduce(past)))
 
 
 def _to_stems(kind: Stems, points_m: F64Array) -> F64Array:
@@ -198,4 +207,5 @@ def _to_rectangle(kind: Rectangles, row: int, points_m: F64Array) -> F64Array:
     nearest = np.zeros_like(local)
     for edge in (kind.along_m[row], kind.across_m[row]):
         nearest += np.clip(local @ edge / (edge @ edge), 0, 1)[:, None] * edge
-    return np.asarray(np.linalg.norm(local - nearest, axis=1))
+    off = local - nearest
+    return np.asarray(np.sqrt(np.einsum("ij,ij->i", off, off)))
