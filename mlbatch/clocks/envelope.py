@@ -73,7 +73,7 @@ class PacketBins:
             self._per_bin *= 2
             self._rows = _merged(self._rows, np.arange(0, len(self._rows), 2))
         number = (self.packets + np.arange(count)) // self._per_bin
-        starts = np.flatnonzero(np.diff(number, prepend=-1))
+        starts = np.concatenate([[0], np.flatnonzero(number[1:] != number[:-1]) + 1])
         rows = _binned(before_ns, before_host_ns, stamp_ns, host_ns, starts)
         if self.packets % self._per_bin:
             # The last bin was not full.
@@ -150,9 +150,13 @@ def offset_rise(pairs: I64Array) -> I64Array:
 def _largest(key: I64Array, starts: I64Array) -> I64Array:
     """Index of the largest key (the first of equal ones) in each run that begins at `starts`."""
     best = np.maximum.reduceat(key, starts)
-    hits = np.flatnonzero(key == np.repeat(best, np.diff(starts, append=len(key))))
+    # np.diff takes several times as long where it appends.
+    sizes = np.concatenate([starts[1:], [len(key)]]) - starts
+    hits = np.flatnonzero(key == np.repeat(best, sizes))
     run = np.searchsorted(starts, hits, side="right")
-    return hits[np.diff(run, prepend=0) > 0]
+    is_first = np.ones(len(run), bool)
+    np.not_equal(run[1:], run[:-1], out=is_first[1:])
+    return hits[is_first]
 
 
 # -- range of bins without a step -----------------------------------------------------------------
