@@ -70,8 +70,13 @@ def _parsed(path: Path) -> ast.Module:
     return ast.parse(path.read_text(encoding="utf-8"))
 
 
-def imports(module: Module, names: frozenset[str]) -> Iterator[Import]:
+@cache
+def imports(module: Module, names: frozenset[str]) -> tuple[Import, ...]:
     """Imports from the package; `names`: all its modules, unlike what they define."""
+    return tuple(_imports(module, names))
+
+
+def _imports(module: Module, names: frozenset[str]) -> Iterator[Import]:
     guarded, called = _inside(module.tree, _is_guard), _inside(module.tree, _is_function)
     for node in ast.walk(module.tree):
         for target in _targets(node, module, names):

@@ -8,6 +8,7 @@ import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import lru_cache
 from unittest.mock import patch
 
 import numpy as np
@@ -81,10 +82,16 @@ def unit(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactor
     return Unit(vendor, sent, table, sensor)
 
 
+@lru_cache(maxsize=1)
+def _sent(vendor: str, spell: Spell) -> Sent:
+    """Packets of a lidar; successive tests differ in their loss alone."""
+    return VENDORS[vendor].send(spell)
+
+
 def two(unit: Unit, ahead_ns: int, clock_ns: int = 0, from_ns: int = 0, loss: float = 0) -> Sent:
     """Packets of two lidars in receive order; the second is received from `from_ns` on."""
     spell = Spell(BEGIN_NS + ahead_ns + clock_ns, LENGTH_NS, 5000, ahead_ns=-clock_ns)
-    other = VENDORS[unit.vendor].send(spell)
+    other = _sent(unit.vendor, spell)
     other = other.where(np.flatnonzero(other.host_ns >= BEGIN_NS + from_ns))
     both = unit.sent.then(other)
     both = both.where(np.argsort(both.host_ns, kind="stable"))
