@@ -9,6 +9,7 @@ import ipaddress
 import struct
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
+from functools import cache
 from pathlib import Path
 
 ETHERNET = 1
@@ -23,6 +24,10 @@ OLD_PACKET = 2
 _UDP = 17
 _FRAGMENT_HEADER = 44
 _ETHERTYPE = {4: 0x0800, 6: 0x86DD}
+
+
+# Parsed once: that takes longer than to make a frame.
+_address = cache(ipaddress.ip_address)
 
 
 def udp_frame(
@@ -42,7 +47,7 @@ def udp_frame(
     `vlans` are ethertypes of stacked tags, outermost first; addresses with colons give IPv6.
     """
     datagram = struct.pack(">4H", sport, dport, len(payload) + 8, 0) + payload
-    version = ipaddress.ip_address(src).version
+    version = _address(src).version
     build = ipv4_packets if version == 4 else ipv6_packets
     packets = build(datagram, src, dst, ident=ident, mtu=mtu)
     return [link_frame(packet, link=link, vlans=vlans, version=version) for packet in packets]
@@ -78,8 +83,8 @@ def ipv4_packet(
         64,
         protocol,
         0,
-        ipaddress.IPv4Address(src).packed,
-        ipaddress.IPv4Address(dst).packed,
+        _address(src).packed,
+        _address(dst).packed,
     )
     header += options
     total_sum = sum(struct.unpack(f">{len(header) // 2}H", header))
@@ -101,7 +106,7 @@ def ipv4_packets(
 
 def ipv6_packet(body: bytes, src: str, dst: str, *, next_header: int = _UDP) -> bytes:
     """One IPv6 packet; `body` begins with the header that `next_header` names."""
-    addresses = ipaddress.IPv6Address(src).packed + ipaddress.IPv6Address(dst).packed
+    addresses = _address(src).packed + _address(dst).packed
     return struct.pack(">IHBB", 6 << 28, len(body), next_header, 64) + addresses + body
 
 
