@@ -209,8 +209,8 @@ class NativeEngine:
             return
         self._set_arrays(
             out,
-            out.is_organized or "range_m" in extras,
-            out.is_organized or "reflectivity" in extras,
+            "range_m" in extras,
+            "reflectivity" in extras,
         )
         wants_column = "column" in extras and not out.is_organized
         self._scan.column = address(out.column) if wants_column else None

@@ -405,6 +405,51 @@ static inline void put_point(float *point, const Planes *planes, int64_t element
     point[3] = planes->level[element];
 }
 
+/* An organized row: arrays from its first slot; range_m and reflectivity may be NULL. */
+typedef struct {
+    float *point;
+    int64_t *labels;
+    float *range_m;
+    uint16_t *reflectivity;
+} Row;
+
+/* Its number in the arrays of the scan. */
+static int64_t organized_row(const Scan *scan, int64_t column)
+{
+    return scan->records ? column % scan->near_columns : scan->first_number + column;
+}
+
+static Row row_at(const Scan *scan, int64_t slot)
+{
+    return (Row){scan->point + 4 * slot, scan->label + slot,
+                 scan->range_m ? scan->range_m + slot : 0,
+                 scan->reflectivity ? scan->reflectivity + slot : 0};
+}
+
+/* Label of slots without a point, by that of any point of the column. */
+static int64_t label_of_empty(int64_t label)
+{
+    return (int64_t)((uint64_t)label >> LIDAR_ID_BIT << LIDAR_ID_BIT);
+}
+
+enum { NAN_BITS = 0x7FC00000 };
+
+/* Slots from `first` to `end` without a point; label: of empty slots. */
+static void empty_slots(const Row *row, int64_t first, int64_t end, int64_t label)
+{
+    const uint32_t nan_bits = NAN_BITS;
+    float nan;
+    memcpy(&nan, &nan_bits, sizeof nan);
+    for (int64_t value = 4 * first; value < 4 * end; value++)
+        row->point[value] = nan;
+    for (int64_t slot = first; slot < end; slot++)
+        row->labels[slot] = label;
+    for (int64_t slot = first; row->range_m && slot < end; slot++)
+        row->range_m[slot] = nan;
+    for (int64_t slot = first; row->reflectivity && slot < end; slot++)
+        row->reflectivity[slot] = 0;
+}
+
 #if defined(__SSE2__)
 /* Rows of lanes 1, 2, 3 after that of lane 0, by the bits of the lanes that are kept, and how many
    are. */
@@ -435,6 +480,42 @@ static inline int64_t store_kept(float *point, int64_t *labels, int64_t row, int
     _mm_storeh_pi((__m64 *)(labels + fourth), _mm_castsi128_ps(high));
     return row + next[3];
 }
+
+/* 32 bits of ones for each lane in `kept`. */
+static inline __m128i mask_of(int kept)
+{
+    const __m128i bits = _mm_set_epi32(8, 4, 2, 1);
+    return _mm_cmpeq_epi32(_mm_and_si128(_mm_set1_epi32(kept), bits), bits);
+}
+
+/* The lanes of `mask`; others are NaN. */
+static inline __m128 or_nan(__m128i mask, __m128 values)
+{
+    return _mm_castsi128_ps(_mm_or_si128(_mm_and_si128(mask, _mm_castps_si128(values)),
+                                         _mm_andnot_si128(mask, _mm_set1_epi32(NAN_BITS))));
+}
+
+/* Store four beams to the slots from `slot`, as `store_kept`; those not in `mask` are empty. */
+static inline void store_slots(float *point, int64_t *labels, int64_t slot, __m128i mask, __m128 p0,
+                               __m128 p1, __m128 p2, __m128 p3, __m128i low, __m128i high,
+                               __m128i empty)
+{
+    const __m128i first = _mm_unpacklo_epi32(mask, mask), last = _mm_unpackhi_epi32(mask, mask);
+    p0 = or_nan(mask, p0);
+    p1 = or_nan(mask, p1);
+    p2 = or_nan(mask, p2);
+    p3 = or_nan(mask, p3);
+    _MM_TRANSPOSE4_PS(p0, p1, p2, p3);
+    point += 4 * slot;
+    _mm_storeu_ps(point, p0);
+    _mm_storeu_ps(point + 4, p1);
+    _mm_storeu_ps(point + 8, p2);
+    _mm_storeu_ps(point + 12, p3);
+    __m128i *words = (__m128i *)(labels + slot);
+    _mm_storeu_si128(words, _mm_or_si128(_mm_and_si128(first, low), _mm_andnot_si128(first, empty)));
+    _mm_storeu_si128(words + 1,
+                     _mm_or_si128(_mm_and_si128(last, high), _mm_andnot_si128(last, empty)));
+}
 #endif
 
 /* -- the usual case in one pass ----------------------------------------------------------------- */
@@ -443,6 +524,7 @@ static inline int64_t store_kept(float *point, int64_t *labels, int64_t row, int
 /* What the beams of a column have in common. Beams are done by fours, from pixels to rows. */
 typedef struct {
     __m128i mask, level_mask, reflectivity_mask, silent, offsets;
+    __m128i empty; /* label of empty slots */
     __m128i shift, level_shift, reflectivity_shift;
     __m128 factor, divisor, cosine, sine, speed;
     __m128 low_m, high_m;
@@ -450,10 +532,14 @@ typedef struct {
     __m128 moves[12];
     const float *direction, *origins, *reach, *firing_ns;
     const int64_t *words;
+    /* Rows, of an organized scan those of the column. */
     float *point;
     int64_t *label;
+    float *ranges_m;
+    uint16_t *reflectivities;
     int64_t used, width, distance_byte, level_byte, reflectivity_byte;
-    int level_word, is_big, is_filtered, is_limited, has_boxes, has_extras, has_moves;
+    int level_word, is_big, is_filtered, is_limited, has_boxes, has_extras, has_moves, is_plain;
+    int is_upright; /* TABLED: `UPRIGHT` fits */
 } Column;
 
 static inline __m128i load_four(const uint8_t *from, int64_t step)
@@ -547,7 +633,7 @@ static inline void move_four(const __m128 *moves, __m128 *xyz)
 }
 
 /* Ranges and reflectivities of the lanes in `kept` to rows from `row`. */
-static inline void store_extras(const Scan *scan, int64_t row, int kept, __m128 range_m,
+static inline void store_extras(const Column *own, int64_t row, int kept, __m128 range_m,
                                 __m128i reflectivity)
 {
     float ranges_m[4];
@@ -555,12 +641,24 @@ static inline void store_extras(const Scan *scan, int64_t row, int kept, __m128 
     _mm_storeu_ps(ranges_m, range_m);
     _mm_storeu_si128((__m128i *)reflectivities, reflectivity);
     for (int lane = 0; lane < 4; lane++) {
-        if (scan->range_m)
-            scan->range_m[row] = ranges_m[lane];
-        if (scan->reflectivity)
-            scan->reflectivity[row] = (uint16_t)reflectivities[lane];
+        if (own->ranges_m)
+            own->ranges_m[row] = ranges_m[lane];
+        if (own->reflectivities)
+            own->reflectivities[row] = (uint16_t)reflectivities[lane];
         row += kept >> lane & 1;
     }
+}
+
+/* The same to slots, as `store_slots`. */
+static inline void store_slot_extras(const Column *own, int64_t slot, __m128i mask, __m128 range_m,
+                                     __m128i reflectivity)
+{
+    /* To 16 bits: signed numbers are not limited when they are packed. */
+    const __m128i wide = _mm_srai_epi32(_mm_slli_epi32(_mm_and_si128(mask, reflectivity), 16), 16);
+    if (own->ranges_m)
+        _mm_storeu_ps(own->ranges_m + slot, or_nan(mask, range_m));
+    if (own->reflectivities)
+        _mm_storel_epi64((__m128i *)(own->reflectivities + slot), _mm_packs_epi32(wide, wide));
 }
 
 static inline __m128i field_of(__m128i words, __m128i shift, __m128i mask)
@@ -570,11 +668,11 @@ static inline __m128i field_of(__m128i words, __m128i shift, __m128i mask)
 
 /* Four beams of a run: their pixels begin at `from`; with `is_read` their words are in `near` and
    `levels`. Return the next row. */
-static inline int64_t decode_four(const Scan *scan, const Group *group, const Column *own,
+FOR_CONSTANTS int64_t decode_four(const Scan *scan, const Group *group, const Column *own,
                                   int64_t kind, int64_t step, int is_plain, int has_moves,
-                                  int is_read, const uint8_t *from, const uint32_t *near,
-                                  const uint32_t *levels, int64_t beam, int64_t row,
-                                  int64_t *counts)
+                                  int is_read, int is_organized, const uint8_t *from,
+                                  const uint32_t *near, const uint32_t *levels, int64_t beam,
+                                  int64_t row, int64_t *counts)
 {
     /* The distance is in the first word, as fields are listed. */
     const __m128i first = is_read ? _mm_load_si128((const __m128i *)near)
@@ -588,7 +686,7 @@ static inline int64_t decode_four(const Scan *scan, const Group *group, const Co
     value = _mm_and_si128(value, own->mask);
     const __m128i found = _mm_cmpgt_epi32(value, own->silent);
     int kept = _mm_movemask_ps(_mm_castsi128_ps(found));
-    if (!kept)
+    if (!kept && !is_organized)
         return row;
     const __m128 range_m = _mm_div_ps(
         _mm_mul_ps(_mm_cvtepi32_ps(_mm_and_si128(value, found)), own->factor), own->divisor);
@@ -597,7 +695,7 @@ static inline int64_t decode_four(const Scan *scan, const Group *group, const Co
     if (!is_plain && own->is_limited) {
         kept &= _mm_movemask_ps(_mm_and_ps(_mm_cmpge_ps(range_m, own->low_m),
                                            _mm_cmple_ps(range_m, own->high_m)));
-        if (!kept)
+        if (!kept && !is_organized)
             return row;
     }
     if (!is_plain && own->has_boxes)
@@ -624,12 +722,20 @@ static inline int64_t decode_four(const Scan *scan, const Group *group, const Co
         if (group->has_reflectivity)
             reflectivity = field_of(load_four(from + own->reflectivity_byte, step),
                                     own->reflectivity_shift, own->reflectivity_mask);
-        store_extras(scan, row, kept, range_m, reflectivity);
+        if (is_organized)
+            store_slot_extras(own, beam, mask_of(kept), range_m, reflectivity);
+        else
+            store_extras(own, row, kept, range_m, reflectivity);
     }
     const __m128i *labels = (const __m128i *)(own->words + beam);
-    return store_kept(own->point, own->label, row, kept, xyz[0], xyz[1], xyz[2], _mm_cvtepi32_ps(level),
-                      _mm_add_epi64(_mm_loadu_si128(labels), own->offsets),
-                      _mm_add_epi64(_mm_loadu_si128(labels + 1), own->offsets));
+    const __m128i low = _mm_add_epi64(_mm_loadu_si128(labels), own->offsets);
+    const __m128i high = _mm_add_epi64(_mm_loadu_si128(labels + 1), own->offsets);
+    if (!is_organized)
+        return store_kept(own->point, own->label, row, kept, xyz[0], xyz[1], xyz[2],
+                          _mm_cvtepi32_ps(level), low, high);
+    store_slots(own->point, own->label, beam, mask_of(kept), xyz[0], xyz[1], xyz[2],
+                _mm_cvtepi32_ps(level), low, high, own->empty);
+    return row + NEXT[kept][3];
 }
 
 /* Add the counts of a column; points: of it. */
@@ -645,9 +751,10 @@ static inline void add_counts(const Column *own, int64_t points, const int64_t *
 }
 
 /* All runs of a column; with constant steps and kinds the compiler leaves out what is not used. */
-static inline int64_t decode_runs(const Scan *scan, const Group *group, const Column *own,
+FOR_CONSTANTS int64_t decode_runs(const Scan *scan, const Group *group, const Column *own,
                                   int64_t kind, int64_t step, int is_plain, int has_moves,
-                                  const uint8_t *record, int64_t row, int64_t *counts)
+                                  int is_organized, const uint8_t *record, int64_t row,
+                                  int64_t *counts)
 {
     int64_t own_counts[COUNTS] = {0};
     const int64_t first_row = row;
@@ -664,7 +771,7 @@ static inline int64_t decode_runs(const Scan *scan, const Group *group, const Co
         }
         for (int64_t beam = 0; beam < beams; beam += 4)
             row = decode_four(scan, group, own, kind, step, is_plain, has_moves, kind != TURNING,
-                              from + beam * step, near + beam,
+                              is_organized, from + beam * step, near + beam,
                               (own->level_word ? levels : near) + beam, first_beam + beam, row,
                               own_counts);
     }
@@ -673,7 +780,7 @@ static inline int64_t decode_runs(const Scan *scan, const Group *group, const Co
 }
 
 /* The same of a column whose beams come in another order than their pixels. */
-static inline int64_t decode_places(const Scan *scan, const Group *group, const Column *own,
+FOR_CONSTANTS int64_t decode_places(const Scan *scan, const Group *group, const Column *own,
                                     int64_t kind, int is_plain, const uint8_t *record, int64_t row,
                                     int64_t *counts)
 {
@@ -685,95 +792,137 @@ static inline int64_t decode_places(const Scan *scan, const Group *group, const 
     if (own->level_word)
         gather_at(record + own->level_byte, group->places, group->slots, levels);
     for (int64_t beam = 0; beam < group->slots; beam += 4)
-        row = decode_four(scan, group, own, kind, 0, is_plain, own->has_moves, 1, record,
+        row = decode_four(scan, group, own, kind, 0, is_plain, own->has_moves, 1, 0, record,
                           near + beam, (own->level_word ? levels : near) + beam, beam, row,
                           own_counts);
     add_counts(own, row - first_row, own_counts, counts);
     return row;
 }
 
-/* A column of a group that `fits_fours`; known: row of its labels. Return the next row. */
-static int64_t decode_fused(const Scan *scan, const Group *group, int64_t member, int64_t column,
-                            int64_t known, const uint8_t *record, int64_t row)
+/* What the beams of a column of a group that `fits_fours` have in common; known: row of its labels;
+   slot: first one of its row in an organized scan, 0 in a dense one. */
+static inline void set_column(const Scan *scan, const Group *group, int64_t member, int64_t column,
+                       int64_t known, int64_t slot, Column *own)
 {
     const int64_t width = group->width, encoder = scan->encoder[column];
     const Field *fields = group->fields;
-    Column own;
-    own.distance_byte = group->word_bytes[fields[DISTANCE].word];
-    own.level_word = (int)fields[INTENSITY].word;
-    own.level_byte = group->word_bytes[fields[INTENSITY].word];
-    own.reflectivity_byte = group->word_bytes[fields[REFLECTIVITY].word];
-    own.is_big = (int)fields[DISTANCE].is_big;
-    own.mask = _mm_set1_epi32((int32_t)fields[DISTANCE].mask);
-    own.level_mask = _mm_set1_epi32((int32_t)fields[INTENSITY].mask);
-    own.reflectivity_mask = _mm_set1_epi32((int32_t)fields[REFLECTIVITY].mask);
-    own.shift = _mm_cvtsi32_si128((int32_t)fields[DISTANCE].shift);
-    own.level_shift = _mm_cvtsi32_si128((int32_t)fields[INTENSITY].shift);
-    own.reflectivity_shift = _mm_cvtsi32_si128((int32_t)fields[REFLECTIVITY].shift);
-    own.silent = _mm_set1_epi32((int32_t)group->silent);
-    own.factor = _mm_set1_ps(group->scale[0]);
-    own.divisor = _mm_set1_ps(group->scale[1]);
-    own.offsets = _mm_set1_epi64x(scan->stamp_ns[column] - scan->start_ns);
-    own.words = group->labels + known * width;
-    own.direction = group->direction + member * 9 * width;
-    own.reach = group->reach ? group->reach + member * width : 0;
-    own.is_limited = group->limits_m != 0;
-    own.low_m = _mm_set1_ps(own.is_limited ? group->limits_m[2 * member] : 0);
-    own.high_m = _mm_set1_ps(own.is_limited ? group->limits_m[2 * member + 1] : 0);
-    own.has_boxes = scan->box_count > 0;
-    own.has_extras = scan->range_m || scan->reflectivity;
-    own.point = scan->point;
-    own.label = scan->label;
-    own.width = width;
-    own.is_filtered = own.is_limited || own.has_boxes;
-    own.has_moves = scan->moves != 0;
-    for (int number = 0; own.has_moves && number < 12; number++)
-        own.moves[number] = _mm_set1_ps(scan->moves[12 * column + number]);
-    const int is_plain = !own.is_filtered && !own.has_extras;
-    int64_t *counts = group->counts + member * COUNTS;
+    own->distance_byte = group->word_bytes[fields[DISTANCE].word];
+    own->level_word = (int)fields[INTENSITY].word;
+    own->level_byte = group->word_bytes[fields[INTENSITY].word];
+    own->reflectivity_byte = group->word_bytes[fields[REFLECTIVITY].word];
+    own->is_big = (int)fields[DISTANCE].is_big;
+    own->mask = _mm_set1_epi32((int32_t)fields[DISTANCE].mask);
+    own->level_mask = _mm_set1_epi32((int32_t)fields[INTENSITY].mask);
+    own->reflectivity_mask = _mm_set1_epi32((int32_t)fields[REFLECTIVITY].mask);
+    own->shift = _mm_cvtsi32_si128((int32_t)fields[DISTANCE].shift);
+    own->level_shift = _mm_cvtsi32_si128((int32_t)fields[INTENSITY].shift);
+    own->reflectivity_shift = _mm_cvtsi32_si128((int32_t)fields[REFLECTIVITY].shift);
+    own->silent = _mm_set1_epi32((int32_t)group->silent);
+    own->factor = _mm_set1_ps(group->scale[0]);
+    own->divisor = _mm_set1_ps(group->scale[1]);
+    own->offsets = _mm_set1_epi64x(scan->stamp_ns[column] - scan->start_ns);
+    own->words = group->labels + known * width;
+    own->direction = group->direction + member * 9 * width;
+    own->reach = group->reach ? group->reach + member * width : 0;
+    own->is_limited = group->limits_m != 0;
+    own->low_m = _mm_set1_ps(own->is_limited ? group->limits_m[2 * member] : 0);
+    own->high_m = _mm_set1_ps(own->is_limited ? group->limits_m[2 * member + 1] : 0);
+    own->has_boxes = scan->box_count > 0;
+    own->has_extras = scan->range_m || scan->reflectivity;
+    own->point = scan->point + 4 * slot;
+    own->label = scan->label + slot;
+    own->ranges_m = scan->range_m ? scan->range_m + slot : 0;
+    own->reflectivities = scan->reflectivity ? scan->reflectivity + slot : 0;
+    own->empty = _mm_set1_epi64x(label_of_empty(own->words[0]));
+    own->width = width;
+    own->is_filtered = own->is_limited || own->has_boxes;
+    own->has_moves = scan->moves != 0;
+    for (int number = 0; own->has_moves && number < 12; number++)
+        own->moves[number] = _mm_set1_ps(scan->moves[12 * column + number]);
+    own->is_plain = !own->is_filtered && !own->has_extras;
     if (group->kind == TABLED) {
         const int64_t at = table_row(group, member, encoder);
-        own.cosine = _mm_set1_ps(group->cosine[at]);
-        own.sine = _mm_set1_ps(group->sine[at]);
+        own->cosine = _mm_set1_ps(group->cosine[at]);
+        own->sine = _mm_set1_ps(group->sine[at]);
         for (int axis = 0; axis < 3; axis++)
-            own.origin[axis] = _mm_set1_ps(group->origin[3 * at + axis]);
+            own->origin[axis] = _mm_set1_ps(group->origin[3 * at + axis]);
+        own->is_upright = width == UPRIGHT_BEAMS && !own->has_moves
+            && group->used[member] == UPRIGHT_VECTORS;
+        return;
+    }
+    own->cosine = _mm_set1_ps(group->cosine[column]);
+    own->sine = _mm_set1_ps(group->sine[column]);
+    own->origins = group->origin + member * 9 * width;
+    own->used = group->used[member];
+    const float speed = speed_of(encoder);
+    own->speed = _mm_set1_ps(speed);
+    own->firing_ns = group->firing_ns && speed != 0.0f ? group->firing_ns + known * width : 0;
+}
+
+/* A column of a dense scan. Return the next row. */
+static int64_t decode_dense(const Scan *scan, const Group *group, int64_t member, int64_t column,
+                            int64_t known, const uint8_t *record, int64_t row)
+{
+    Column own;
+    set_column(scan, group, member, column, known, 0, &own);
+    int64_t *counts = group->counts + member * COUNTS;
+    const int has_moves = own.has_moves;
+    if (group->kind == TABLED) {
         if (group->places)
             return decode_places(scan, group, &own, TABLED, 0, record, row, counts);
-        const int is_short = is_plain && !own.is_big && group->step == 4;
-        const int is_long = is_plain && !own.is_big && group->step == 12;
-        const int is_upright = width == UPRIGHT_BEAMS && !own.has_moves
-            && group->used[member] == UPRIGHT_VECTORS;
-        if (is_short && is_upright)
-            return decode_runs(scan, group, &own, UPRIGHT, 4, 1, 0, record, row, counts);
-        if (is_long && is_upright)
-            return decode_runs(scan, group, &own, UPRIGHT, 12, 1, 0, record, row, counts);
-        if (is_short && own.has_moves)
-            return decode_runs(scan, group, &own, TABLED, 4, 1, 1, record, row, counts);
-        if (is_short)
-            return decode_runs(scan, group, &own, TABLED, 4, 1, 0, record, row, counts);
-        if (is_long && own.has_moves)
-            return decode_runs(scan, group, &own, TABLED, 12, 1, 1, record, row, counts);
+        const int is_short = !own.is_big && group->step == 4;
+        const int is_long = !own.is_big && group->step == 12 && own.is_plain;
+        if (is_short && own.is_plain && own.is_upright)
+            return decode_runs(scan, group, &own, UPRIGHT, 4, 1, 0, 0, record, row, counts);
+        if (is_short && own.is_upright)
+            return decode_runs(scan, group, &own, UPRIGHT, 4, 0, 0, 0, record, row, counts);
+        if (is_long && own.is_upright)
+            return decode_runs(scan, group, &own, UPRIGHT, 12, 1, 0, 0, record, row, counts);
+        if (is_short && own.is_plain && has_moves)
+            return decode_runs(scan, group, &own, TABLED, 4, 1, 1, 0, record, row, counts);
+        if (is_short && own.is_plain)
+            return decode_runs(scan, group, &own, TABLED, 4, 1, 0, 0, record, row, counts);
+        if (is_long && has_moves)
+            return decode_runs(scan, group, &own, TABLED, 12, 1, 1, 0, record, row, counts);
         if (is_long)
-            return decode_runs(scan, group, &own, TABLED, 12, 1, 0, record, row, counts);
-        return decode_runs(scan, group, &own, TABLED, group->step, 0, own.has_moves, record, row,
+            return decode_runs(scan, group, &own, TABLED, 12, 1, 0, 0, record, row, counts);
+        return decode_runs(scan, group, &own, TABLED, group->step, 0, has_moves, 0, record, row,
                            counts);
     }
-    own.cosine = _mm_set1_ps(group->cosine[column]);
-    own.sine = _mm_set1_ps(group->sine[column]);
-    own.origins = group->origin + member * 9 * width;
-    own.used = group->used[member];
-    const float speed = speed_of(encoder);
-    own.speed = _mm_set1_ps(speed);
-    own.firing_ns = group->firing_ns && speed != 0.0f ? group->firing_ns + known * width : 0;
-    if (group->places && is_plain)
+    if (group->places && own.is_plain)
         return decode_places(scan, group, &own, TURNING, 1, record, row, counts);
     if (group->places)
         return decode_places(scan, group, &own, TURNING, 0, record, row, counts);
-    if (is_plain && group->step == 3 && own.has_moves)
-        return decode_runs(scan, group, &own, TURNING, 3, 1, 1, record, row, counts);
-    if (is_plain && group->step == 3)
-        return decode_runs(scan, group, &own, TURNING, 3, 1, 0, record, row, counts);
-    return decode_runs(scan, group, &own, TURNING, group->step, 0, own.has_moves, record, row,
+    if (own.is_plain && group->step == 3 && has_moves)
+        return decode_runs(scan, group, &own, TURNING, 3, 1, 1, 0, record, row, counts);
+    if (own.is_plain && group->step == 3)
+        return decode_runs(scan, group, &own, TURNING, 3, 1, 0, 0, record, row, counts);
+    return decode_runs(scan, group, &own, TURNING, group->step, 0, has_moves, 0, record, row,
+                       counts);
+}
+
+/* A column of an organized scan whose slots are beams. Return `row` and the number of points. */
+static int64_t decode_slots(const Scan *scan, const Group *group, int64_t member, int64_t column,
+                            int64_t known, const uint8_t *record, int64_t row)
+{
+    const int64_t slot = organized_row(scan, column) * mlbatch_row_step(scan);
+    const Row rest = row_at(scan, slot);
+    Column own;
+    memset(&own, 0, sizeof own);
+    set_column(scan, group, member, column, known, slot, &own);
+    empty_slots(&rest, group->beams, scan->row_slots, label_of_empty(own.words[0]));
+    int64_t *counts = group->counts + member * COUNTS;
+    const int is_usual = !own.is_big && own.is_upright;
+    if (is_usual && own.is_plain && group->step == 4)
+        return decode_runs(scan, group, &own, UPRIGHT, 4, 1, 0, 1, record, row, counts);
+    if (is_usual && group->step == 4)
+        return decode_runs(scan, group, &own, UPRIGHT, 4, 0, 0, 1, record, row, counts);
+    if (is_usual && own.is_plain && group->step == 12)
+        return decode_runs(scan, group, &own, UPRIGHT, 12, 1, 0, 1, record, row, counts);
+    if (group->kind == TABLED)
+        return decode_runs(scan, group, &own, TABLED, group->step, 0, own.has_moves, 1, record,
+                           row, counts);
+    return decode_runs(scan, group, &own, TURNING, group->step, 0, own.has_moves, 1, record, row,
                        counts);
 }
 #endif
@@ -906,90 +1055,13 @@ static void emit_extras(const Scan *scan, const Group *group, const int64_t *ord
     }
 }
 
-/* An organized row: arrays from its first slot; range_m and reflectivity may be NULL. */
-typedef struct {
-    float *point;
-    int64_t *labels;
-    float *range_m;
-    uint16_t *reflectivity;
-} Row;
-
-/* Slots from `first` to `end` without a point; label: of empty slots. */
-static void empty_slots(const Row *row, int64_t first, int64_t end, int64_t label)
-{
-    const uint32_t nan_bits = 0x7FC00000;
-    float nan;
-    memcpy(&nan, &nan_bits, sizeof nan);
-    for (int64_t value = 4 * first; value < 4 * end; value++)
-        row->point[value] = nan;
-    for (int64_t slot = first; slot < end; slot++)
-        row->labels[slot] = label;
-    for (int64_t slot = first; row->range_m && slot < end; slot++)
-        row->range_m[slot] = nan;
-    for (int64_t slot = first; row->reflectivity && slot < end; slot++)
-        row->reflectivity[slot] = 0;
-}
-
-#if defined(__SSE2__)
-/* Slots that are beams, four at a time. No branch depends on which of them have points. */
-static void organize_fours(const Row *row, int64_t beams, int64_t empty, const Planes *planes)
-{
-    const __m128 nan = _mm_castsi128_ps(_mm_set1_epi32(0x7FC00000));
-    const __m128i nothing = _mm_set1_epi64x(empty);
-    for (int64_t beam = 0; beam < beams; beam += 4) {
-        int32_t bytes;
-        memcpy(&bytes, planes->keep + beam, sizeof bytes);
-        /* A byte 0 or 1 of each beam to a mask of 32 bits. */
-        __m128i wide = _mm_cvtsi32_si128(bytes);
-        wide = _mm_unpacklo_epi8(wide, _mm_setzero_si128());
-        wide = _mm_unpacklo_epi16(wide, _mm_setzero_si128());
-        const __m128i kept = _mm_cmpgt_epi32(wide, _mm_setzero_si128());
-        const __m128 mask = _mm_castsi128_ps(kept);
-        const __m128 none = _mm_andnot_ps(mask, nan);
-        __m128 x = _mm_or_ps(_mm_and_ps(_mm_load_ps(planes->x + beam), mask), none);
-        __m128 y = _mm_or_ps(_mm_and_ps(_mm_load_ps(planes->y + beam), mask), none);
-        __m128 z = _mm_or_ps(_mm_and_ps(_mm_load_ps(planes->z + beam), mask), none);
-        __m128 level = _mm_or_ps(_mm_and_ps(_mm_load_ps(planes->level + beam), mask), none);
-        _MM_TRANSPOSE4_PS(x, y, z, level);
-        _mm_storeu_ps(row->point + 4 * beam, x);
-        _mm_storeu_ps(row->point + 4 * beam + 4, y);
-        _mm_storeu_ps(row->point + 4 * beam + 8, z);
-        _mm_storeu_ps(row->point + 4 * beam + 12, level);
-        const __m128i *labels = (const __m128i *)(planes->label + beam);
-        const __m128i masks[] = {_mm_unpacklo_epi32(kept, kept), _mm_unpackhi_epi32(kept, kept)};
-        for (int half = 0; half < 2; half++) {
-            const __m128i own = _mm_and_si128(_mm_load_si128(labels + half), masks[half]);
-            _mm_storeu_si128((__m128i *)(row->labels + beam) + half,
-                             _mm_or_si128(own, _mm_andnot_si128(masks[half], nothing)));
-        }
-        if (row->range_m)
-            _mm_storeu_ps(row->range_m + beam,
-                          _mm_or_ps(_mm_and_ps(_mm_load_ps(planes->range_m + beam), mask), none));
-    }
-    for (int64_t beam = 0; row->reflectivity && beam < beams; beam++)
-        row->reflectivity[beam] =
-            (uint16_t)(planes->reflectivity[beam] & -(int32_t)planes->keep[beam]);
-}
-#endif
-
-/* Row `number` of an organized scan: every kept element to its slot, the others empty. */
-static int64_t emit_organized(const Scan *scan, const Group *group, int64_t number,
+/* The row of a column in an organized scan: every kept element to its slot, the others empty. */
+static int64_t emit_organized(const Scan *scan, const Group *group, int64_t column,
                               const Planes *planes)
 {
-    const int64_t first = number * mlbatch_row_step(scan), width = group->width;
-    const Row row = {scan->point + 4 * first, scan->label + first,
-                     scan->range_m ? scan->range_m + first : 0,
-                     scan->reflectivity ? scan->reflectivity + first : 0};
-    const int64_t empty =
-        (int64_t)((uint64_t)planes->label[0] >> LIDAR_ID_BIT << LIDAR_ID_BIT);
-#if defined(__SSE2__)
-    if (!group->slot) {
-        organize_fours(&row, group->beams, empty, planes);
-        empty_slots(&row, group->beams, scan->row_slots, empty);
-        return count_kept(planes->keep, group->beams);
-    }
-#endif
-    empty_slots(&row, 0, scan->row_slots, empty);
+    const int64_t width = group->width;
+    const Row row = row_at(scan, organized_row(scan, column) * mlbatch_row_step(scan));
+    empty_slots(&row, 0, scan->row_slots, label_of_empty(planes->label[0]));
     int64_t count = 0;
     for (int64_t which = 0; which < group->returns; which++)
         for (int64_t element = which * width; element < which * width + group->beams; element++)
@@ -1070,7 +1142,9 @@ static int64_t decode_column(const Scan *scan, const Group *group, int64_t membe
     group->counts[member * COUNTS + COLUMNS]++;
 #if defined(__SSE2__)
     if (group->fits_fours && !scan->row_slots)
-        return decode_fused(scan, group, member, column, known, record, row);
+        return decode_dense(scan, group, member, column, known, record, row);
+    if (group->fits_fours && scan->row_slots && !group->slot)
+        return decode_slots(scan, group, member, column, known, record, row);
     if (fits_places(scan, group))
         return decode_placed(scan, group, member, column, known, record, row);
 #endif
@@ -1086,11 +1160,8 @@ static int64_t decode_column(const Scan *scan, const Group *group, int64_t membe
     if (scan->moves)
         move_planes(scan->moves + 12 * column, group->returns * group->width, planes);
     label(group, known, offset_ns, planes);
-    if (scan->row_slots) {
-        const int64_t number =
-            scan->records ? column % scan->near_columns : scan->first_number + column;
-        return row + emit_organized(scan, group, number, planes);
-    }
+    if (scan->row_slots)
+        return row + emit_organized(scan, group, column, planes);
     const int64_t *order = group->order ? group->order + table * group->order_step : 0;
     emit_extras(scan, group, order, row, planes);
 #if defined(__SSE2__)

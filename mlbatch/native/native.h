@@ -24,6 +24,13 @@
 #define EXPORT __attribute__((visibility("default")))
 #endif
 
+/* Functions that are compiled once for each set of constant arguments. */
+#if defined(__GNUC__)
+#define FOR_CONSTANTS static inline __attribute__((always_inline))
+#else
+#define FOR_CONSTANTS static inline
+#endif
+
 /* Limits of the scratch arrays. */
 #define MOST_BEAMS 256
 #define MOST_RETURNS 3
