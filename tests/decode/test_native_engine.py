@@ -242,8 +242,15 @@ def test_any_pixels_of_any_profile(case: Case, profile: str, beams: int) -> None
 @pytest.mark.parametrize("pose", range(len(POSES)))
 @pytest.mark.parametrize("profile", ["RNG15_RFL8_NIR8", "RNG19_RFL8_SIG16_NIR16"])
 @pytest.mark.parametrize("origin_m", [None, 0.0, -0.0])
+@pytest.mark.parametrize("layout", ["dense", "organized"])
+@pytest.mark.parametrize("extras", [frozenset(), EXTRAS], ids=["plain", "extras"])
 def test_upright_sensors_with_beams_at_elevation_0(
-    pose: int, profile: str, origin_m: float | None, monkeypatch: pytest.MonkeyPatch
+    pose: int,
+    profile: str,
+    origin_m: float | None,
+    layout: str,
+    extras: frozenset[str],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """Terms of zero are left out: origins of -0 show their sign."""
     altitude_deg = (5.0,) * 64 + (0.0,) * 64
@@ -253,8 +260,9 @@ def test_upright_sensors_with_beams_at_elevation_0(
     if origin_m is not None:
         rows = np.full((512, 3, 1), origin_m, np.float32)
         monkeypatch.setattr(BeamTable, "origins", lambda self: rows)
-    case = Case(pose, 700, "dense", frozenset(), is_cut=False, keeps_repeated=True)
-    check([cast(Lidar, found.lidar({}, None))], case)
+    for is_cut in (False, True):
+        case = Case(pose, 700, layout, extras, is_cut=is_cut, keeps_repeated=True)
+        check([cast(Lidar, found.lidar({}, None))], case)
 
 
 @given(case=cases, chosen=st.lists(st.integers(0, len(OTHERS) + 1), min_size=1, max_size=4))
