@@ -32,6 +32,7 @@ WANTED = (
     replace(_CUT, extras=frozenset({"column", "reflectivity"}), min_range_m=0.0, boxes_m=()),
     Job((), extras=EXTRAS, layout="organized", keep_repeated=True),
     replace(_CUT, extras=frozenset({"reflectivity"}), layout="organized"),
+    Job((), extras=frozenset(), layout="organized"),
 )
 
 

@@ -71,7 +71,8 @@ _MOST_BYTES = 2000
 def _lidars() -> Sequence[Lidar]:
     with tempfile.TemporaryDirectory() as name:
         others = [lidar_of(make, words, Path(name)) for make, words in OTHERS]
-    return (*(ouster(name, 16) for name in NAMES), *others)
+    # The loops have a case for 128 beams.
+    return (*(ouster(name, beams) for beams in (16, 128) for name in NAMES), *others)
 
 
 @lru_cache(maxsize=1)
@@ -126,7 +127,8 @@ def _decode(data: bytes, folder: Path) -> None:
     place = rng.choice(every, _COLUMNS)
     word = words_of(lidar, rng, _COLUMNS)
     stamp_ns = np.sort(rng.integers(START_NS, END_NS, _COLUMNS))
-    columns = WindowColumns(stamp_ns, np.zeros(_COLUMNS, np.int64), place, word)
+    moves = rng.normal(size=(_COLUMNS, 3, 4)).astype(np.float32) if rng.random() < 0.3 else None
+    columns = WindowColumns(stamp_ns, np.zeros(_COLUMNS, np.int64), place, word, moves)
     pair.check(columns, ScanHeader(0, 0, START_NS, END_NS, True, 0))
 
 
