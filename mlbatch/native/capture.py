@@ -14,7 +14,7 @@ from mlbatch.native.library import address, library
 NO_ROOM, CUT, TOO_LONG = range(3)
 # Room for frames of one walk.
 _ROOM = 1 << 14
-# Sets of fragments that `join` can tell from others.
+# Open sets of fragments that `join` leaves out, at most.
 JOIN_SETS = 64
 
 
