@@ -1,9 +1,9 @@
-"""Names of array types, and a median that loads no masked arrays."""
+"""Names of array types, and what numpy does with more copies or modules."""
 
 from __future__ import annotations
 
 import math
-from typing import TypeAlias
+from typing import TypeAlias, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -17,6 +17,12 @@ I64Array: TypeAlias = npt.NDArray[np.int64]
 F32Array: TypeAlias = npt.NDArray[np.float32]
 F64Array: TypeAlias = npt.NDArray[np.float64]
 BoolArray: TypeAlias = npt.NDArray[np.bool_]
+_Scalar = TypeVar("_Scalar", bound=np.generic)
+
+
+def rows_of(array: npt.NDArray[_Scalar], mask: BoolArray) -> npt.NDArray[_Scalar]:
+    """Return the rows of an array where a mask (n,) is true; the array itself where all are."""
+    return array if mask.all() else array[mask]
 
 
 def median(values: F64Array | I64Array) -> float:

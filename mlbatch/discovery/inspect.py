@@ -479,7 +479,7 @@ def _measure(
             if whole and sampler.count(kind, index, batch):
                 late.add(kind)
                 # It may be of one of the sensors.
-                discovery.router.route(kind, np.frombuffer(sampler.kinds[kind].payloads[0], "u1"))
+                discovery.router.route(kind, sampler.kinds[kind].arrays()[0][0])
             owned = np.zeros(len(index), np.bool_)
             owners = [sensor for sensor in discovery.sensors if kind in sensor.kinds]
             for sensor in owners:
@@ -553,8 +553,7 @@ def _stream_report(
     sampler = discovery.sampler
     samples = sampler.kinds[kind]
     # Routing first: it may add a kind to its sensor.
-    payload = np.frombuffer(samples.payloads[0], np.uint8)
-    route = discovery.router.route(kind, payload)
+    route = discovery.router.route(kind, samples.arrays()[0][0])
     span_ns = samples.last_host_ns - samples.first_host_ns
     report = StreamReport(
         stream=str(sampler.table.streams[kind.stream]),

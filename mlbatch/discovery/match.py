@@ -17,7 +17,7 @@ from typing import NamedTuple, NoReturn
 import numpy as np
 
 from mlbatch import sensors
-from mlbatch.arrays import BoolArray
+from mlbatch.arrays import BoolArray, rows_of
 from mlbatch.discovery.sampler import Sampler
 from mlbatch.discovery.types import DetectedSensor, PacketKind
 from mlbatch.errors import RecordingError, RigError
@@ -118,7 +118,9 @@ def _parts(
             continue
         own = lidar.sent_by_me(evidence.sample[:, : lidar.packet_size])
         if own.any():
-            part = evidence._replace(sample=evidence.sample[own], host_ns=evidence.host_ns[own])
+            part = evidence._replace(
+                sample=rows_of(evidence.sample, own), host_ns=rows_of(evidence.host_ns, own)
+            )
             yield number, own, part
 
 
@@ -421,10 +423,10 @@ def describe(sampler: Sampler, kind: PacketKind) -> str | None:
 def release(sampler: Sampler, kinds: Iterable[PacketKind]) -> None:
     """Replace large samples of some kinds by descriptions; only `describe` can use them then."""
     for kind in kinds:
-        payloads = sampler.kinds[kind].payloads
-        if len(payloads) * kind.size > _LARGE_BYTES:
+        samples = sampler.kinds[kind]
+        if len(samples.host_ns) * kind.size > _LARGE_BYTES:
             sampler.released[kind] = describe(sampler, kind)
-            payloads.clear()
+            samples.pieces.clear()
 
 
 def _refuse_same_packets(table: StreamTable, found: Sequence[DetectedSensor], origin: Path) -> None:

@@ -170,8 +170,9 @@ def _first_lidar_host_ns(batch: PacketBatch, crowd: Crowd) -> int | None:
     """
     begins_ns = []
     for kind, index in crowd.followed(batch, split_by_kind(batch)):
-        checked = batch.start[index[:_CHECKED], None] + np.arange(kind.size)
-        text = sensors.describe(kind.size, batch.data[checked])
+        begins = batch.start[index[:_CHECKED]].tolist()
+        checked = np.stack([batch.data[begin : begin + kind.size] for begin in begins])
+        text = sensors.describe(kind.size, checked)
         if text is not None and "lidar" in text:
             begins_ns.append(int(batch.host_ns[index[0]]))
     return min(begins_ns, default=None)

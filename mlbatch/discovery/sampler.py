@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from mlbatch.arrays import I64Array, U8Array
+from mlbatch.arrays import I64Array, U8Array, rows_of
 from mlbatch.clocks.watch import ClockWatch
 from mlbatch.discovery.crowd import Crowd
 from mlbatch.discovery.types import DetectedSensor, PacketKind
@@ -35,7 +35,7 @@ _WORD_BYTES = 4
 class KindSamples:
     """Samples and counts of one packet kind; times are receive times."""
 
-    payloads: list[bytes]  # of the kept packets
+    pieces: list[bytes]  # payloads of the kept packets, one or more each
     host_ns: list[int]  # of the kept packets, receive times
     numbers: list[int]  # of the kept packets, among all of the kind
     packets: int  # count, kept or not
@@ -46,8 +46,11 @@ class KindSamples:
 
     def arrays(self) -> tuple[U8Array, I64Array]:
         """Kept payloads (k, size) and their receive times (k,)."""
-        payloads = np.frombuffer(b"".join(self.payloads), np.uint8)
-        rows = payloads.reshape(len(self.payloads), len(self.payloads[0]))
+        if len(self.pieces) > 1:
+            # Once: they may be megabytes, and every check of a sensor needs them.
+            self.pieces = [b"".join(self.pieces)]
+        payloads = np.frombuffer(self.pieces[0], np.uint8)
+        rows = payloads.reshape(len(self.host_ns), len(payloads) // len(self.host_ns))
         return rows, np.array(self.host_ns, np.int64)
 
 
@@ -74,7 +77,7 @@ class Sampler:
             for row in _rows_to_keep(samples, kind, index, batch):
                 at = int(index[row])
                 begin = int(batch.start[at])
-                samples.payloads.append(batch.data[begin : begin + kind.size].tobytes())
+                samples.pieces.append(batch.data[begin : begin + kind.size].tobytes())
                 samples.host_ns.append(int(batch.host_ns[at]))
                 samples.numbers.append(samples.packets + row)
             samples.packets += len(index)
@@ -104,7 +107,7 @@ class Sampler:
         if is_new:
             samples = self._new(kind, first_ns)
             begin = int(batch.start[index[0]])
-            samples.payloads.append(batch.data[begin : begin + kind.size].tobytes())
+            samples.pieces.append(batch.data[begin : begin + kind.size].tobytes())
             samples.host_ns.append(first_ns)
             samples.numbers.append(0)
         samples = self.kinds[kind]
@@ -153,7 +156,8 @@ class Sampler:
         packets, host_ns = samples.arrays()
         packets = packets[:, : lidar.packet_size]
         good = lidar.sent_by_me(packets) & (lidar.faults(packets) == 0)
-        return packets[good], host_ns[good], np.array(samples.numbers, np.int64)[good]
+        numbers = np.array(samples.numbers, np.int64)
+        return rows_of(packets, good), rows_of(host_ns, good), rows_of(numbers, good)
 
     def first_host_ns(self, sensor: DetectedSensor) -> int | None:
         """Receive time of the first packet of a sensor; None if it sent none."""

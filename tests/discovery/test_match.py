@@ -124,5 +124,5 @@ def test_large_samples_are_replaced_by_descriptions(tmp_path: Path) -> None:
         before = {kind: describe(sampler, kind) for kind in sampler.kinds}
         release(sampler, sampler.kinds)
         assert {kind: describe(sampler, kind) for kind in sampler.kinds} == before
-        released = [not one.payloads for one in sampler.kinds.values()]
+        released = [not one.pieces for one in sampler.kinds.values()]
         assert any(released) == is_large

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from mlbatch.arrays import BoolArray, F64Array, I64Array, U8Array
+from mlbatch.arrays import BoolArray, F64Array, I64Array, U8Array, rows_of
 from mlbatch.errors import RigError
 from mlbatch.lidar.geometry import BeamTable, Projection
 from mlbatch.lidar.header_table import StampedColumns
@@ -109,7 +109,8 @@ class OusterCalibration:
         if is_off or evidence.size not in (size, size + 1) or not len(evidence.sample):
             return 0
         packets = evidence.sample[:, :size]
-        good = packets[(self._headers.faults(packets) == 0) & self._headers.sent_by_me(packets)]
+        is_good = (self._headers.faults(packets) == 0) & self._headers.sent_by_me(packets)
+        good = rows_of(packets, is_good)
         if 2 * len(good) <= len(packets):
             return 0
         return _FITS_SIZE + self._ids_fit(good) + self._ports_fit(evidence)
