@@ -1,4 +1,4 @@
-"""The median is numpy's."""
+"""The median is numpy's, and rows of a mask are those that numpy selects."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
-from mlbatch.arrays import median
+from mlbatch.arrays import median, rows_of
 
 SHAPES = arrays.array_shapes(min_dims=1, max_dims=2, max_side=40)
 
@@ -37,3 +37,17 @@ def test_by_hand(values: list[int], expected: float) -> None:
 
 def test_of_nothing() -> None:
     assert math.isnan(median(np.empty(0)))
+
+
+@given(arrays.arrays(np.uint8, arrays.array_shapes(min_dims=2, max_dims=2, max_side=9)), st.data())
+def test_rows_of_a_mask(
+    values: np.ndarray[tuple[int, ...], np.dtype[np.uint8]], data: st.DataObject
+) -> None:
+    chosen = data.draw(st.lists(st.booleans(), min_size=len(values), max_size=len(values)))
+    expected = [row for row, is_chosen in zip(values.tolist(), chosen, strict=True) if is_chosen]
+    assert rows_of(values, np.array(chosen, np.bool_)).tolist() == expected
+
+
+def test_all_rows_are_not_copied() -> None:
+    values = np.arange(6).reshape(3, 2)
+    assert rows_of(values, np.ones(3, np.bool_)) is values

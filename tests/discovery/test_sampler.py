@@ -92,3 +92,16 @@ def test_rate_and_clock_of_a_sensor(tmp_path: Path) -> None:
         assert offset_ns is not None
         assert offset_ns / NS_PER_S == pytest.approx(offset_s, abs=1e-9)
         assert found.sampler.has_receive_times(sensor)
+
+
+def test_samples_may_be_asked_for_between_batches() -> None:
+    host_ns = [BEGIN_NS + number * NS_PER_MS for number in range(6)]
+    sampler = _sampled([_batch(host_ns[:4], [1, 2, 3, 4])])
+    samples = sampler.kinds[PacketKind(0, SIZE)]
+    for words, more in (([1, 2, 3, 4], []), ([1, 2, 3, 4, 5, 6], [5, 6])):
+        if more:
+            sampler.add(_batch(host_ns[4:], more))
+        for _ in range(2):
+            packets, received_ns = samples.arrays()
+            assert packets[:, 0].tolist() == words
+            assert received_ns.tolist() == host_ns[: len(words)]
