@@ -27,6 +27,8 @@ _RSS_UNIT_BYTES: Final = 1 if os.uname().sysname == "Darwin" else 1024
 # Measured processes import the mlbatch of the measuring process.
 _PACKAGE_FOLDER: Final = str(Path(__file__).resolve().parents[2])
 _LIBRARIES: Final = ("numpy", "isal", "mcap", "zstandard")
+# Of x86 and Arm, as /proc/cpuinfo names them.
+_VECTOR_FLAGS: Final = ("sse", "ssse", "avx", "fma", "asimd", "neon", "sve")
 
 
 class BenchError(MlbatchError):
@@ -75,10 +77,15 @@ def measure(name: str, command: Sequence[str], folder: Path) -> Usage:
 
 
 def machine() -> dict[str, int | float | str]:
-    """Processor, memory, system, load and versions."""
+    """Processor and its vector instructions, memory, system, load and versions."""
     memory_bytes = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    try:
+        described = Path("/proc/cpuinfo").read_text(encoding="utf-8")
+    except OSError:
+        described = ""
     return {
-        "cpu": _cpu(),
+        "cpu": cpu_model(described) or platform.processor() or platform.machine(),
+        "cpu_flags": vector_flags(described),
         "cores": os.cpu_count() or 0,
         "memory_mb": memory_bytes // BYTES_PER_MB,
         "system": f"{platform.system()} {platform.release().split('-')[0]} {platform.machine()}",
@@ -97,11 +104,18 @@ def version(distribution: str) -> str:
         return ""
 
 
-def _cpu() -> str:
-    """Model name of the processor."""
-    try:
-        text = Path("/proc/cpuinfo").read_text(encoding="utf-8")
-    except OSError:
-        text = ""
-    names = [line.partition(":")[2].strip() for line in text.splitlines() if "model name" in line]
-    return names[0] if names else platform.processor() or platform.machine()
+def cpu_model(described: str) -> str:
+    """Name of the processor in the text of /proc/cpuinfo; empty if it has none."""
+    return _value(described, "model name")
+
+
+def vector_flags(described: str) -> str:
+    """Flags of vector instructions in the text of /proc/cpuinfo, in its order."""
+    flags = _value(described, "flags") or _value(described, "Features")
+    return " ".join(flag for flag in flags.split() if flag.startswith(_VECTOR_FLAGS))
+
+
+def _value(described: str, key: str) -> str:
+    """First value of a key in the text of /proc/cpuinfo; empty without one."""
+    pairs = (line.partition(":") for line in described.splitlines())
+    return next((value.strip() for name, _, value in pairs if name.strip() == key), "")

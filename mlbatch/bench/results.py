@@ -273,7 +273,7 @@ _CHANGE_HEAD: Final = ("case", "program", *(f"{of}, now/before" for of in _FIELD
 # Cells aligned to the left, the others to the right.
 _LEFT_CELLS: Final = 2
 _LEFT_RATIO_CELLS: Final = 4
-_MACHINE_LINE: Final = ("cpu", "cores", "memory_mb", "system", "load")
+_MACHINE_LINE: Final = ("cpu", "cpu_flags", "cores", "memory_mb", "system", "load")
 
 
 def lines(result: Result) -> list[str]:
@@ -283,6 +283,7 @@ def lines(result: Result) -> list[str]:
     head = [
         f"{machine['cpu']}, {machine['cores']} cores, {machine['memory_mb']} MB, "
         f"{machine['system']}",
+        f"vector instructions: {machine['cpu_flags'] or 'unknown'}",
         f"{result.date}, load {machine['load']:.1f}, {', '.join(versions)}",
         f"{result.seconds:g} s of recording, medians of {result.repeat}, MB: largest; "
         "own: CPU without start and imports; read to write: time of the stages, ns/slot",

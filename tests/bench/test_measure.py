@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from mlbatch.bench.measure import BenchError, Usage, measure
+from mlbatch.bench.measure import BenchError, Usage, cpu_model, measure, vector_flags
 from tests.contract.tree import run_python
 
 # Run in a small process: pages of the measuring process count, too.
@@ -72,3 +72,22 @@ def test_bytecode_is_cached_as_for_an_installed_package(
 def test_failures(tmp_path: Path, command: list[str], message: str) -> None:
     with pytest.raises(BenchError, match=message):
         measure("printer", command, tmp_path)
+
+
+# Two cores, as Linux describes them; shortened.
+X86 = """processor\t: 0
+model name\t: Abacus: 3000
+flags\t\t: fpu sse sse2 ht pni ssse3 fma sse4_2 avx f16c avx2 avx512f clwb
+
+processor\t: 1
+model name\t: Abacus: 3000
+flags\t\t: fpu sse
+"""
+ARM = "processor\t: 0\nBogoMIPS\t: 50.00\nFeatures\t: fp asimd aes sve crc32\n"
+
+
+def test_processor_and_vector_instructions() -> None:
+    assert cpu_model(X86) == "Abacus: 3000"
+    assert vector_flags(X86) == "sse sse2 ssse3 fma sse4_2 avx avx2 avx512f"
+    assert (cpu_model(ARM), vector_flags(ARM)) == ("", "asimd sve")
+    assert (cpu_model(""), vector_flags("")) == ("", "")

@@ -45,6 +45,7 @@ WRITTEN = replace(READ, written_bytes=20_000_000)
 FLOORED = replace(WRITTEN, read_bytes=0)
 MACHINE: dict[str, Json] = {
     "cpu": "Abacus",
+    "cpu_flags": "sse2 avx",
     "cores": 2,
     "memory_mb": 1000,
     "system": "S",
@@ -213,7 +214,7 @@ def test_other_files_are_refused(tmp_path: Path, text: str | None, message: str)
 
 def test_a_line_has_medians_in_the_units_of_the_head() -> None:
     runs = [run(cpu_s, stages_s=STAGES) for cpu_s in (1.0, 5.0, 2.0)]
-    head, line = (one.split("  ") for one in lines(result(row("numpy", runs)))[4:6])
+    head, line = (one.split("  ") for one in lines(result(row("numpy", runs)))[5:7])
     cells = dict(zip(filter(None, head), filter(None, line), strict=True))
     assert {name.strip(): cell.strip() for name, cell in cells.items()} == {
         "case": "dual-4",
@@ -236,13 +237,14 @@ def test_a_line_has_medians_in_the_units_of_the_head() -> None:
 def test_the_machine_and_the_date_come_first() -> None:
     found = lines(result(row("numpy", [run(1.0)])))
     assert found[0] == "Abacus, 2 cores, 1000 MB, S"
-    assert found[1] == "2026-01-02T03:04:05Z, load 0.5, mlbatch 0.1.0, python 3.11.7"
-    assert found[2].startswith("10 s of recording, medians of 3, ")
+    assert found[1] == "vector instructions: sse2 avx"
+    assert found[2] == "2026-01-02T03:04:05Z, load 0.5, mlbatch 0.1.0, python 3.11.7"
+    assert found[3].startswith("10 s of recording, medians of 3, ")
 
 
 def test_programs_without_counts_have_empty_cells() -> None:
     found = lines(result(row("start", [run(1.0, workload=Workload())])))
-    assert found[5].split() == ["dual-4", "start", "1.000", "0.500", "2.000", "0.0", "80"]
+    assert found[6].split() == ["dual-4", "start", "1.000", "0.500", "2.000", "0.0", "80"]
 
 
 def test_ratios_changes_and_notes_follow() -> None:
