@@ -58,7 +58,7 @@ test-quick: $(VENV)/dev.stamp
 test-lowest: $(LOWEST)/dev.stamp
 	$(LOWEST)/bin/python -m pytest -n 2 --dist worksteal -m 'not slow and not long'
 
-# PCL and CloudCompare: apt-get install pcl-tools cloudcompare; the reader of JavaScript: node, npm.
+# PCL, CloudCompare, Open3D: apt-get install pcl-tools cloudcompare libusb-1.0-0; JavaScript: node, npm.
 test-consumers: $(VENV)/dev.stamp
 	$(BIN)/python -m pytest tests/consumers/check_consumers.py -v -rs
 

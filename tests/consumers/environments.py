@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import json
 import os
 import shutil
@@ -122,6 +123,14 @@ def run_of_system(*command: str | Path, cwd: Path) -> str:
     """What a program of the system prints; skips the test without it."""
     program, *arguments = map(str, command)
     return _run([_program(program), *arguments], cwd)
+
+
+def need_library(name: str) -> None:
+    """Skip the test without a library of the system that packages expect."""
+    try:
+        ctypes.CDLL(name)
+    except OSError:
+        pytest.skip(f"{name} is not installed (docs/consumers.md says which package has it)")
 
 
 def _program(name: str) -> str:
