@@ -158,6 +158,11 @@ class Batcher:
         return [track.intake.rejected for track in self._tracks]
 
     @property
+    def renumbered(self) -> list[int]:
+        """Duplicates of each sensor, by their number, whose timestamps are others."""
+        return [track.intake.renumbered for track in self._tracks]
+
+    @property
     def dropped(self) -> list[dict[str, int]]:
         """Columns of each sensor that are written to no window, by reason."""
         return [track.dropped for track in self._tracks]

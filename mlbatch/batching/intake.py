@@ -92,7 +92,10 @@ def _extent(low: I64Array, high: I64Array, *, is_rising: bool) -> tuple[int, int
 
 
 class Intake:
-    """Filter of the packets of one sensor; `rejected` counts rejected packets by reason."""
+    """Filter of the packets of one sensor; `rejected` counts rejected packets by reason.
+
+    renumbered: duplicates by their number whose timestamps are others.
+    """
 
     def __init__(
         self,
@@ -113,6 +116,7 @@ class Intake:
         self.has_receive_times = has_receive_times
         self.loss = PacketLoss(modulus, packet_ns)
         self.rejected: dict[str, int] = {}
+        self.renumbered = 0
         self._host_clock = host_clock
         self._offset_ns = offset_ns
         self._newest = NEVER
@@ -120,11 +124,13 @@ class Intake:
         self._held: Arrival | None = None
         # Keys of the newest packets: DUPLICATE_REACH of them or more, once there are so many.
         self._recent: list[I64Array] = []
+        # First timestamp of each.
+        self._recent_ns: list[I64Array] = []
         self._largest_key = -1
 
     def accept(self, arrival: Arrival) -> Accepted:
         """Accept the good packets of a batch; ClockJump where the clock was reset."""
-        fresh = self._distinct(arrival.key)
+        fresh = self._distinct(arrival.key, arrival.headers.stamp_ns[:, 0])
         if fresh is not None:
             arrival = arrival.take(fresh)
         headers = arrival.headers
@@ -172,15 +178,16 @@ class Intake:
 
     # -- duplicates ---------------------------------------------------------------------------
 
-    def _distinct(self, key: I64Array) -> BoolArray | None:
+    def _distinct(self, key: I64Array, first_ns: I64Array) -> BoolArray | None:
         """Mask of packets that repeat none of the last DUPLICATE_REACH; None: all are new."""
         rises = len(key) > 0 and int(key[0]) > self._largest_key
         if rises and (len(key) == 1 or bool((key[1:] > key[:-1]).all())):
             # The usual case: every key is larger than all before it.
-            self._remember(key)
+            self._remember(key, first_ns)
             self._largest_key = int(key[-1])
             return None
         recent = np.concatenate([*self._recent, _NONE])[-DUPLICATE_REACH:]
+        recent_ns = np.concatenate([*self._recent_ns, _NONE])[-DUPLICATE_REACH:]
         if len(key) == 1:
             # One key without an order: a linear search is cheaper than a sort.
             fresh = np.array([key[0] < 0 or not (recent == key).any()])
@@ -190,15 +197,23 @@ class Intake:
             fresh = _first_of_kind(recent, key)
         self._largest_key = max(int(recent.max(initial=-1)), int(key.max(initial=-1)))
         self._recent = [recent]
-        self._remember(key)
+        self._recent_ns = [recent_ns]
+        self._remember(key, first_ns)
         repeated = len(key) - int(np.count_nonzero(fresh))
         self._reject("duplicate", repeated)
-        return fresh if repeated else None
+        if not repeated:
+            return None
+        known = len(recent)
+        keys = np.concatenate([recent, key])
+        self.renumbered += _count_renumbered(keys, np.concatenate([recent_ns, first_ns]), known)
+        return fresh
 
-    def _remember(self, key: I64Array) -> None:
+    def _remember(self, key: I64Array, first_ns: I64Array) -> None:
         self._recent.append(key)
+        self._recent_ns.append(first_ns.copy())
         if len(self._recent) > _MAX_PIECES:
             self._recent = [np.concatenate(self._recent)[-DUPLICATE_REACH:]]
+            self._recent_ns = [np.concatenate(self._recent_ns)[-DUPLICATE_REACH:]]
 
     # -- stamps -------------------------------------------------------------------------------
 
@@ -317,6 +332,17 @@ def _first_of_kind(recent: I64Array, key: I64Array) -> BoolArray:
     fresh = np.ones(len(keys), bool)
     fresh[order[1:][again]] = False
     return fresh[len(recent) :]
+
+
+def _count_renumbered(key: I64Array, first_ns: I64Array, known: int) -> int:
+    """Number of packets whose number an earlier one with another timestamp had.
+
+    known: packets that were counted before.
+    """
+    order = key.argsort(kind="stable")
+    ordered = key[order]
+    again = (ordered[1:] == ordered[:-1]) & (ordered[1:] >= 0) & (order[1:] >= known)
+    return int(np.count_nonzero(again & (np.diff(first_ns[order]) != 0)))
 
 
 def _joined(first: Arrival, second: Arrival) -> Arrival:

@@ -21,6 +21,7 @@ from mlbatch.clocks.timescale import (
     EPOCHS,
     HOST,
     UNKNOWN,
+    UPTIME,
     domain_of,
     format_difference,
     kind_of_jump,
@@ -121,6 +122,8 @@ class ClockEstimate(NamedTuple):
             text += f", about {name}" if "second" not in name else ""
         if self.drift_ppm is not None:
             text += f", drift {self.drift_ppm:+.2f} +-{self.drift_uncertainty_ppm:.2f} ppm"
+        if self.domain == UPTIME and not self.mode:
+            text += ", no time source is named: dates would be of 1970"
         for jump in self.jumps:
             text += f"; {jump.describe()}"
         return text + (f"; more than {MAX_SEGMENTS - 1} jumps" if self.unsteady else "")

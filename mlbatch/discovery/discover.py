@@ -118,6 +118,8 @@ class Discovery:
     sampler: Sampler
     recordings: Sequence[Recording]  # to read: decoded clouds are packets
     examined: list[Path]  # files that may be calibrations
+    # Why matching calibrations cannot be used.
+    unusable: tuple[str, ...] = ()
     rig: Rig | None = None
     notes: list[Note] = field(default_factory=list)
     not_in_rig: set[PacketKind] = field(default_factory=set)
@@ -225,6 +227,9 @@ def discover(
         sampler=sampler,
         recordings=recordings,
         examined=examined,
+        unusable=tuple(
+            f"{table.streams[kind.stream]}: {why}" for kind, why in matched.failures.items()
+        ),
         rig=rig,
         notes=notes,
         not_in_rig=set() if rig is None else set(lidar_kinds),

@@ -76,7 +76,7 @@ _MEASURE = (
     "{translation_m: [x, y, z], rotation_rpy_deg: [r, p, y]}"
 )
 # Warnings that concern a conversion; the table shows missing metadata and decoders.
-_CONVERSION_ONLY = frozenset({"no_decoder", "no_metadata", "calibration", "not_seen_yet"})
+_CONVERSION_ONLY = frozenset({"no_decoder", "no_metadata", "not_seen_yet"})
 
 
 @dataclass(frozen=True, slots=True)
@@ -384,17 +384,20 @@ def _selector(table: StreamTable, sensor: DetectedSensor) -> StreamSelector:
 
 
 def _notes(discovery: Discovery) -> Iterator[str]:
-    """Damage, times of decoded clouds, contradictions, shared addresses, missing lidars."""
+    """Damage, times of decoded clouds, calibrations, contradictions, shared addresses, lidars."""
     for recording in discovery.recordings:
         for text in recording.notes:
             yield f"{recording.path.name}: {text}"
     for recording in discovery.recordings:
         for text in recording.verdicts if isinstance(recording, CloudRecording) else ():
             yield f"{recording.path.name}: {text}"
+    yield from discovery.unusable
     for note in discovery.notes:
         if note.code not in _CONVERSION_ONLY:
             yield note.message
     for sensor in discovery.sensors:
+        if sensor.lidar.unproven:
+            yield f"{sensor.name}: {Path(sensor.lidar.calibration).name}: {sensor.lidar.unproven}"
         problem = shared_address(discovery.sampler, sensor)
         if problem:
             yield problem

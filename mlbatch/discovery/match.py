@@ -111,7 +111,8 @@ def _parts(
             yield number, everything, evidence
             continue
         try:
-            lidar = calibration.lidar(options, evidence)
+            # Without packets, which may be those of several units.
+            lidar = calibration.lidar(options, None)
         except RigError:
             continue  # The output of this sensor is off.
         if evidence.size not in (lidar.packet_size, lidar.packet_size + 1):
@@ -343,6 +344,9 @@ def _detect(sampler: Sampler, expected: ExpectedSensor, origin: Path) -> Detecte
     usable = expected.usable()
     if not usable:
         _refuse_no_metadata(expected, origin)
+    has_own_file = any(serial and one.serial == serial for one in usable)
+    if has_own_file:
+        usable = [one for one in usable if one.serial == serial]
     matches: dict[int, _Match] = {}
     failures: list[str] = []
     other_serials: set[str] = set()
@@ -368,9 +372,8 @@ def _detect(sampler: Sampler, expected: ExpectedSensor, origin: Path) -> Detecte
                     known.fit = fit
     if matches:
         return _chosen(sampler, expected, list(matches.values()), origin)
-    has_own_file = any(one.serial == serial for one in usable)
     start = f"{origin}: sensor {expected.name}:"
-    if failures and not (serial and has_own_file):
+    if failures:
         raise RigError(f"{start} {failures[0]}")
     if serial and not has_own_file:
         found = ", ".join(sorted(other_serials - {""}))

@@ -455,7 +455,7 @@ def _sensors(report: Values) -> str:
                 position,
                 angles,
                 sensor.text("extrinsics", "source"),
-                sensor.text("calibration"),
+                "; ".join(filter(None, map(sensor.text, ("calibration", "calibration_note")))),
             )
         )
     return _section("Sensors", _table(head, rows))

@@ -55,7 +55,7 @@ REMEDIES = {
     "cloud_time": "state the unit of the time field in the rig (points: unit)",
     "clouds": "nothing to do; check that the interpretation is correct",
 }
-_INFORMATION = frozenset({"clouds", "constant_tf", "calibration"})
+_INFORMATION = frozenset({"clouds", "constant_tf"})
 _SERIOUS = frozenset({"clocks", "clock_jump", "recording", "clock_epoch"})
 
 # Shares of packets or columns.
@@ -285,7 +285,9 @@ def _warnings(report: Values) -> Iterator[Finding]:
     for one in report.items("warnings"):
         code = one.text("code")
         level = Level.WARNING
-        if code in _INFORMATION:
+        # Other notes on a calibration say what was assumed, and contradict nothing.
+        is_note = code == "calibration" and "expected" not in one.text("message")
+        if code in _INFORMATION or is_note:
             level = Level.NOTE
         elif code in _SERIOUS:
             level = Level.PROBLEM

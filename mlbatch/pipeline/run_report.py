@@ -88,6 +88,14 @@ LOST = 0.001
 # Share of a sensor's packets, or columns, above which there is a warning: a change of mode, a wrong
 # calibration; one damaged timestamp in the future makes those that follow it late.
 MANY = 0.01
+# Main reason of rejections, as in docs/report.md.
+_WHY_REJECTED = {
+    "bad_size": "their size is not that of the first packets",
+    "bad_header": "their model or mode is not that of the first packets",
+    "bad_crc": "their checksums are wrong",
+    "bad_stamp": "their timestamps are those of no steady clock",
+    "duplicate": "their numbers are those of earlier packets with other timestamps",
+}
 # How long an IMU may be integrated without a warning, s, and the error it names, m/s2.
 DRIFT_S = 10
 _USUAL_ERROR = 0.05
@@ -150,12 +158,16 @@ def final_notes(run: Conversion) -> list[Note]:
     notes += _epoch_notes(run)
     for sensor in run.sensors:
         packets = sensor.ledger.packets
-        # A packet captured twice is no loss.
-        reasons_of = {r: n for r, n in packets.rejected.items() if r != "duplicate"}
-        rejected = sum(reasons_of.values())
+        # A packet captured twice is no loss, but another packet of the same number is.
+        counts = packets.rejected | {"duplicate": run.batcher.renumbered[sensor.index]}
+        rejected = sum(counts.values())
         if rejected > MANY * packets.read:
-            reasons = ", ".join(f"{n} {reason}" for reason, n in reasons_of.items())
-            text = f"{sensor.name}: {rejected} of {packets.read} packets rejected ({reasons})"
+            by_count = sorted((one for one in counts.items() if one[1]), key=lambda one: -one[1])
+            reasons = ", ".join(f"{count} {reason}" for reason, count in by_count)
+            why = _WHY_REJECTED[by_count[0][0]]
+            text = (
+                f"{sensor.name}: {rejected} of {packets.read} packets rejected ({reasons}): {why}"
+            )
             notes.append(Note("rejected", sensor.name, text))
         decoded = sensor.ledger.columns.decoded
         late = sensor.ledger.columns.dropped.get("late", 0)
@@ -382,6 +394,7 @@ def _sensor(run: Conversion, sensor: Sensor) -> SensorReport:
         extrinsics_source=sensor.detected.pose.describe(),
         body_from_sensor=sensor.body_from_sensor,
         calibration=Path(sensor.lidar.calibration).name,
+        calibration_note=sensor.lidar.unproven,
     )
 
 

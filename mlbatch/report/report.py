@@ -72,6 +72,7 @@ class SensorReport(NamedTuple):
     extrinsics_source: str
     body_from_sensor: F64Array
     calibration: str  # file name without folder
+    calibration_note: str = ""  # for information
 
 
 class Timing(NamedTuple):
@@ -256,6 +257,11 @@ def summary_lines(run: RunReport) -> list[str]:
         none = scans.without.get(name, 0)
         tail = f": {none} have none" if none else ""
         lines.append(f"{count} scans lack columns of {name}{tail}")
+    lines += [
+        f"extrinsics of {sensor.name} are from its metadata, {sensor.calibration}"
+        for sensor in run.sensors
+        if sensor.extrinsics_source == "metadata"
+    ]
     if run.timing is not None:
         timing = run.timing
         lines.append(
@@ -314,6 +320,7 @@ def _sensor(sensor: SensorReport) -> Section:
             "body_from_sensor": sensor.body_from_sensor.tolist(),
         },
         "calibration": sensor.calibration,
+        **({"calibration_note": sensor.calibration_note} if sensor.calibration_note else {}),
     }
 
 

@@ -53,6 +53,7 @@ class BaseLidar:
     timestamp_mode: str = ""
     clock_period_ns: int = 0
     notes: tuple[str, ...] = ()
+    unproven: str = ""
 
     @property
     def header_bytes(self) -> I64Array:

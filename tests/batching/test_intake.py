@@ -59,6 +59,17 @@ def test_the_second_of_two_equal_packets_is_a_duplicate() -> None:
     arrival = _arrival([10], [20], [10], [30], [30], keys=[5, 6, 5, 7, 7])
     assert _stamps_ms(intake.accept(arrival)) == [[10], [20], [30]]
     assert intake.rejected == {"duplicate": 2}
+    assert intake.renumbered == 0
+
+
+def test_other_packets_of_the_same_number_are_counted_apart() -> None:
+    intake = Intake("left")
+    intake.accept(_arrival([10], [20], [10], [25], keys=[5, 6, 5, 6]))
+    assert (intake.rejected, intake.renumbered) == ({"duplicate": 2}, 1)
+    # Across batches, and once each.
+    intake.accept(_arrival([25], [30], keys=[6, 7]))
+    intake.accept(_arrival([31], keys=[7]))
+    assert (intake.rejected, intake.renumbered) == ({"duplicate": 4}, 2)
 
 
 def test_a_duplicate_is_known_across_batches() -> None:

@@ -14,6 +14,12 @@ NO_LIDAR = (
 )
 DATA_PORT = "; check that the recording contains the sensor's data port"
 
+OTHER_MODE = (
+    "found those of 512x10 (512 columns per revolution, measurement ids up to 255, columns 195.3 "
+    "us apart): the mode changed after the metadata were saved, all azimuths would be wrong; save "
+    "the metadata from the sensor again, or give those that were saved with this recording"
+)
+
 # (arguments after `convert`, exit code, message); `-o out` is added unless it is there. {*} matches
 # words of the parser, which differ between its versions, and lists that grow.
 MISTAKES: dict[str, tuple[str, int, str]] = {
@@ -342,6 +348,25 @@ MISTAKES: dict[str, tuple[str, int, str]] = {
         "bare/drive.pcap: 10.0.0.1 > port 7502 carries Ouster lidar, serial 111, 1280 bytes: "
         "needs its metadata; expected metadata that match, found only 222.json; give the sensor's "
         "with --metadata FILE" + OUSTER,
+    ),
+    "metadata saved before a change of mode": (
+        "mode/drive.pcap",
+        1,
+        "mode/drive.pcap: 10.0.0.1 > port 7502: mode/111.json: Ouster metadata, lidar_mode: "
+        f"expected packets of 1024x10, {OTHER_MODE} (without a match: 111.json)",
+    ),
+    "metadata of another mode in the rig": (
+        "mode/drive.pcap --rig mode.yaml",
+        1,
+        "mode.yaml: sensor left: mode/111.json: Ouster metadata, lidar_mode: expected packets of "
+        f"1024x10, {OTHER_MODE}",
+    ),
+    "beams with the sign turned": (
+        "turned/drive.pcap --metadata turned/111.json",
+        1,
+        "turned/111.json: Ouster metadata, beam_altitude_angles: expected angles that fall from "
+        "the top beam to the lowest, found -20 to 20 degrees, as if their sign were turned; save "
+        "the metadata from the sensor again",
     ),
     "no metadata": (
         "bare/drive.pcap",

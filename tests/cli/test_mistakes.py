@@ -60,6 +60,7 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def _write_sessions(folder: Path) -> None:
     one = Unit()
     write_session(folder / "bare", one, metadata=False)
+    _write_other_modes(folder)
     write_session(folder / "uptime", UPTIME)
     write_session(folder / "pair", one, twin(one, 222))
     behind = replace(twin(one, 222), begin_ns=one.begin_ns - 3600 * NS_PER_S)
@@ -70,6 +71,18 @@ def _write_sessions(folder: Path) -> None:
     write_session(folder / "twice", one, more=[one.records[7]])
     whole = write_session(folder / "cut", one)
     whole.write_bytes(whole.read_bytes()[:-338])
+
+
+def _write_other_modes(folder: Path) -> None:
+    """Metadata of 1024x10, of packets of 512x10; also named by a rig with their serial number."""
+    write_session(folder / "mode", Unit(), metadata=False)
+    write_metadata(folder / "mode" / "111.json", replace(SMALL, columns_per_frame=1024))
+    (folder / "mode.yaml").write_text(
+        'sensors: [{name: left, metadata: mode/111.json, stream: {serial: "111"}}]\n'
+    )
+    write_session(folder / "turned", Unit(), metadata=False)
+    turned = tuple(sorted(SMALL.altitudes_deg()))
+    write_metadata(folder / "turned" / "111.json", replace(SMALL, altitude_deg=turned))
 
 
 def _files(folder: Path) -> list[Path]:

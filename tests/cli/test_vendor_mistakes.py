@@ -223,7 +223,10 @@ def test_packets_of_another_size_are_told_and_counted(shell: Shell, tmp_path: Pa
     assert sensor["packets"]["rejected"] == {"bad_size": MANY}
     (name, text), (same, counted) = _warnings(report)
     assert name == same == "hesai_1"
-    assert counted == f"hesai_1: {MANY} of {2 * MANY} packets rejected ({MANY} bad_size)"
+    assert counted == (
+        f"hesai_1: {MANY} of {2 * MANY} packets rejected ({MANY} bad_size): their size is not that "
+        "of the first packets"
+    )
     assert text == (
         f"{IP} > port {PORT}: expected packets of 1262 bytes as at first, found 1266 bytes as "
         "well, which are rejected as bad_size; split the recording where the settings of the lidar "
@@ -239,7 +242,10 @@ def test_packets_of_another_return_mode_are_rejected(
     assert report["sensors"][0]["packets"]["rejected"] == {"bad_header": MANY}
     assert report["sensors"][0]["packets"]["accepted"] == MANY
     ((_, text),) = _warnings(report)
-    assert text.endswith(f"{MANY} of {2 * MANY} packets rejected ({MANY} bad_header)")
+    assert text.endswith(
+        f"{MANY} of {2 * MANY} packets rejected ({MANY} bad_header): their model or mode is not "
+        "that of the first packets"
+    )
 
 
 def test_metadata_that_fit_nothing_are_told(shell: Shell, tmp_path: Path) -> None:

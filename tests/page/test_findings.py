@@ -110,6 +110,9 @@ def test_the_verdict_is_the_worst_finding() -> None:
     assert others == "1 problem and 1 warning below."
     last = findings(Values(document), None)[-1]
     assert (last.level, last.code, last.text) == (Level.NOTE, "calibration", "a note")
+    # One that contradicts the packets is no mere note.
+    warning["message"] = "expected packets of 1024x20, found those of 1024x10"
+    assert Level.WARNING in [one.level for one in findings(Values(document), None) if one.code]
 
 
 def test_a_run_without_a_scan_is_a_problem() -> None:

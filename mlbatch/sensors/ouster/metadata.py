@@ -45,7 +45,7 @@ _MARKS = ("beam_altitude_angles", "beam_intrinsics", "lidar_data_format")
 _SENSOR_INFO_MARKS = ("prod_line", "prod_sn", "initialization_id")
 _SHOWN_CHARS = 60
 _RIGID_TOLERANCE = 1e-3
-_REMEDY = "save the metadata from the sensor again"
+REMEDY = "save the metadata from the sensor again"
 
 
 class Document(NamedTuple):
@@ -60,7 +60,7 @@ class Document(NamedTuple):
         shown = text if len(text) <= _SHOWN_CHARS else text[: _SHOWN_CHARS - 3] + "..."
         shown = " ".join(shown.split()) or "nothing"
         raise RigError(
-            f"{self.path}: Ouster metadata, {key}: expected {expected}, found {shown}; {_REMEDY}"
+            f"{self.path}: Ouster metadata, {key}: expected {expected}, found {shown}; {REMEDY}"
         )
 
     def text(self, key: str) -> str:
@@ -153,7 +153,7 @@ def read_document(path: Path, content: bytes) -> Document | None:
             return None
         text = str(err).splitlines()[0][:200]
         raise RigError(
-            f"{path}: Ouster metadata: expected a JSON document, found {text}; {_REMEDY}"
+            f"{path}: Ouster metadata: expected a JSON document, found {text}; {REMEDY}"
         ) from err
     if not isinstance(top, dict) or not _is_ouster(top):
         return None
@@ -176,6 +176,8 @@ def _is_ouster(top: dict[str, object]) -> bool:
     )
 
 
+# Beams are listed from the top; calibrated neighbours may be out of order by less than this.
+_RISE_DEG = 0.5
 # Largest angles of beams.
 _ANGLES_DEG = {"beam_altitude_angles": 90.0, "beam_azimuth_angles": 360.0}
 _DEFAULT_LIDAR_PORT = 7502
@@ -231,6 +233,12 @@ class Metadata(NamedTuple):
     imu_samples: int
     notes: tuple[str, ...]
 
+    @property
+    def revolutions_per_s(self) -> int:
+        """By the mode, such as 1024x10; 0 if the metadata have no mode."""
+        hz = self.lidar_mode.rpartition("x")[2]
+        return int(hz) if hz.isdigit() else 0
+
 
 def parse_metadata(document: Document) -> Metadata:
     """Check and convert all fields of a document; RigError names a field that cannot be used."""
@@ -269,7 +277,7 @@ def parse_metadata(document: Document) -> Metadata:
         imu_port=_DEFAULT_IMU_PORT if imu_port is None else imu_port,
         imu_profile=document.text("udp_profile_imu") or LEGACY,
         imu_samples=document.integer("imu_measurements_per_packet", 0, _U16) or 0,
-        notes=tuple(_notes(document, layout.beams)),
+        notes=tuple(_notes(document, altitude_deg)),
     )
 
 
@@ -291,7 +299,14 @@ def _angles_deg(document: Document) -> tuple[F64Array, F64Array]:
             document.fail(key, expected, str(angles[np.abs(angles).argmax()]))
         found.append(angles)
         count = len(angles)
-    return found[0], found[1]
+    altitude_deg, azimuth_deg = found
+    if altitude_deg[-1] > altitude_deg[0]:
+        document.fail(
+            "beam_altitude_angles",
+            "angles that fall from the top beam to the lowest",
+            f"{altitude_deg[0]:g} to {altitude_deg[-1]:g} degrees, as if their sign were turned",
+        )
+    return altitude_deg, azimuth_deg
 
 
 def _layout(document: Document, beams: int) -> PacketLayout:
@@ -394,8 +409,16 @@ def _extrinsics(document: Document) -> F64Array | None:
     return None if pose is None or np.array_equal(pose, np.eye(4)) else pose
 
 
-def _notes(document: Document, beams: int) -> Iterator[str]:
+def _notes(document: Document, altitude_deg: F64Array) -> Iterator[str]:
     """Notes for the user on unusual metadata."""
+    beams = len(altitude_deg)
+    rises = np.flatnonzero(np.diff(altitude_deg) > _RISE_DEG)
+    if len(rises):
+        above, below = altitude_deg[rises[0] : rises[0] + 2]
+        yield (
+            f"{document.path}: Ouster metadata, beam_altitude_angles: expected angles that fall "
+            f"from beam to beam, found {below:g} after {above:g} degrees; {REMEDY}"
+        )
     product = re.match(r"OS-\w+-(\d+)", document.text("prod_line"))
     if product and int(product[1]) != beams:
         # Firmware before 1.14 has 64 angles and 64-beam packets for units of 16 and 32 beams.

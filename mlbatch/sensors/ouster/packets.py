@@ -123,7 +123,10 @@ class LegacyHeaders(NamedTuple):
         return np.ones(len(packets), np.bool_)
 
     def faults(self, packets: U8Array) -> U8Array:
-        """`bad_header` unless the valid columns of a packet are neighbours in one frame."""
+        """`bad_header` unless the valid columns of a packet are neighbours in one frame.
+
+        Ids beyond the frame are of another mode than that of the metadata.
+        """
         columns = self._columns(packets)
         measured = self._measured(packets)
         frame = columns["frame_id"].astype(np.int64)
@@ -132,12 +135,17 @@ class LegacyHeaders(NamedTuple):
         same = (frame == np.take_along_axis(frame, first, 1)) & (
             block == np.take_along_axis(block, first, 1)
         )
-        bad = (measured & ~same).any(axis=1)
+        beyond = columns["measurement_id"] >= self.columns_per_frame
+        bad = (measured & (~same | beyond)).any(axis=1)
         return np.where(bad, BAD_HEADER, 0).astype(np.uint8)
 
     def frame_ids(self, packets: U8Array) -> I64Array:
         """(P,) frame id."""
         return self._columns(packets)["frame_id"][:, 0].astype(np.int64)
+
+    def encoders(self, packets: U8Array) -> I64Array:
+        """(P, C) rotor position of each column, in ticks."""
+        return self._columns(packets)["encoder"].astype(np.int64)
 
     def init_ids(self, packets: U8Array) -> I64Array:
         """(P,) 0: packets carry none."""
@@ -172,8 +180,7 @@ class PacketHeaders(NamedTuple):
 
     def column_headers(self, packets: U8Array) -> ColumnHeaders:
         """Timestamps, measurement ids and validity of all columns."""
-        raw = column_bytes(packets, self.layout)[:, :, : COLUMN.itemsize]
-        columns = np.ascontiguousarray(raw).view(COLUMN)[..., 0]
+        columns = self._columns(packets)
         mid = columns["measurement_id"].astype(np.int64)
         valid = ((columns["status"] & 1) != 0) & (mid < self.columns_per_frame)
         return ColumnHeaders(columns["stamp_ns"].astype(np.int64), mid, valid)
@@ -217,8 +224,14 @@ class PacketHeaders(NamedTuple):
         return np.asarray(owned | (found == 0) | (self.serial == 0))
 
     def faults(self, packets: U8Array) -> U8Array:
-        """(P,) `bad_header` for other packets, `bad_crc` for changed ones if `check_crc`."""
-        bad = self._read(packets, "packet_type") != LIDAR_PACKET
+        """(P,) `bad_header` for other packets, `bad_crc` for changed ones if `check_crc`.
+
+        Ids beyond the frame are of another mode than that of the metadata.
+        """
+        columns = self._columns(packets)
+        beyond = columns["measurement_id"] >= self.columns_per_frame
+        bad = (beyond & ((columns["status"] & 1) != 0)).any(axis=1)
+        bad |= self._read(packets, "packet_type") != LIDAR_PACKET
         verdict: U8Array = bad * np.uint8(BAD_HEADER)
         if self.check_crc and self.header == STANDARD:
             # Only packets with STANDARD headers have a checksum, and not of early firmware.
@@ -238,6 +251,10 @@ class PacketHeaders(NamedTuple):
     def serials(self, packets: U8Array) -> I64Array:
         """(P,) serial number."""
         return self._read(packets, "serial")
+
+    def _columns(self, packets: U8Array) -> np.ndarray[tuple[int, ...], np.dtype[np.void]]:
+        raw = column_bytes(packets, self.layout)[:, :, : COLUMN.itemsize]
+        return np.ascontiguousarray(raw).view(COLUMN)[..., 0]
 
     def _read(self, packets: U8Array, field: str) -> I64Array:
         value = _header_field(packets, HEADERS[self.header], field)

@@ -7,7 +7,7 @@ C columns with one timestamp each; the pixels of a column fire together, without
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 import numpy as np
@@ -27,7 +27,8 @@ from mlbatch.sensors.ouster.imu import (
     read_legacy,
     sample_count,
 )
-from mlbatch.sensors.ouster.metadata import Metadata, parse_metadata, read_document
+from mlbatch.sensors.ouster.metadata import REMEDY, Metadata, parse_metadata, read_document
+from mlbatch.sensors.ouster.mode import as_sent, seen_in
 from mlbatch.sensors.ouster.packets import (
     Headers,
     LegacyHeaders,
@@ -73,12 +74,19 @@ MODELS: tuple[SensorModel, ...] = tuple(
 
 BUILT_IN: tuple[Calibration, ...] = ()
 
-# Match scores: the serial number decides, then the configuration, then the ports.
+# Match scores: the serial number decides, then mode and configuration, then the ports.
 _FITS_SERIAL = 1000
+_FITS_MODE = 200
 _FITS_INIT_ID = 100
 _FITS_LIDAR_PORT = 10
 _FITS_IMU_PORT = 2
 _FITS_SIZE = 1
+_UNPROVEN = (
+    "metadata not proven: packets and metadata have no serial number in common, only packet size "
+    "and mode were compared"
+)
+# Measurement ids of any mode.
+_ANY_IDS = 1 << 16
 _FRAME_IDS = {FUSA: 1 << 32}
 _DEFAULT_FRAME_IDS = 1 << 16
 
@@ -100,7 +108,8 @@ class OusterCalibration:
         self.model = described.product or f"Ouster {described.layout.beams}-beam"
         self.serial = str(described.serial) if described.serial else ""
         self.is_shared = False
-        self._headers = _headers(described, check_crc=False)
+        # Metadata of another mode are refused by an error that says so.
+        self._headers = _headers(described._replace(columns_per_frame=_ANY_IDS), check_crc=False)
 
     def match_score(self, evidence: Evidence) -> int:
         """Match score of packets; old ROS drivers append one byte to payloads."""
@@ -108,22 +117,48 @@ class OusterCalibration:
         is_off = self.metadata.layout.profile.returns == 0
         if is_off or evidence.size not in (size, size + 1) or not len(evidence.sample):
             return 0
-        packets = evidence.sample[:, :size]
-        is_good = (self._headers.faults(packets) == 0) & self._headers.sent_by_me(packets)
-        good = rows_of(packets, is_good)
-        if 2 * len(good) <= len(packets):
+        good = self._good(evidence)
+        if 2 * len(good) <= len(evidence.sample):
             return 0
-        return _FITS_SIZE + self._ids_fit(good) + self._ports_fit(evidence)
+        try:
+            as_sent(self.metadata, seen_in(self.metadata, self._headers, good))
+            mode = _FITS_MODE
+        except RigError:
+            mode = 0
+        return _FITS_SIZE + mode + self._ids_fit(good) + self._ports_fit(evidence)
 
     def lidar(self, options: Mapping[str, str], evidence: Evidence | None) -> OusterLidar:
-        """Decoder of the sensor; RigError if its profile has no pixels."""
+        """Decoder of the sensor; RigError if its profile has no pixels, or for another mode."""
         check_options(options)
         if self.metadata.layout.profile.returns == 0:
             raise RigError(
                 f"{self.path}: Ouster metadata, udp_profile_lidar: expected a profile with pixels, "
                 f"found {self.metadata.layout.profile.name}; leave the sensor out of the rig"
             )
-        return OusterLidar(self.metadata, self.model, self.serial, "crc" in options)
+        described = self.metadata
+        good = None if evidence is None else self._good(evidence)
+        if good is not None and len(good):
+            described = as_sent(described, seen_in(described, self._headers, good))
+            described = described._replace(notes=(*described.notes, *self._other_init_id(good)))
+        return OusterLidar(described, self.model, self.serial, "crc" in options)
+
+    def _good(self, evidence: Evidence) -> U8Array:
+        """Intact packets of the unit."""
+        packets = evidence.sample[:, : self.metadata.layout.packet_size]
+        return rows_of(
+            packets, (self._headers.faults(packets) == 0) & self._headers.sent_by_me(packets)
+        )
+
+    def _other_init_id(self, packets: U8Array) -> Iterator[str]:
+        """A note if packets carry another initialization id than the metadata."""
+        expected = self.metadata.init_id
+        seen = set(self._headers.init_ids(packets).tolist()) - {0}
+        if expected and seen and expected not in seen:
+            yield (
+                f"{self.path}: Ouster metadata: expected packets of initialization_id {expected}, "
+                f"found {min(seen)}: the sensor was started or set again after the metadata were "
+                f"saved; {REMEDY}, or check that no setting changed"
+            )
 
     def _ids_fit(self, packets: U8Array) -> int:
         serial = self.metadata.serial
@@ -180,6 +215,7 @@ class OusterLidar:
         self.clock_period_ns = 0
         self.calibration = str(described.path)
         self.notes = described.notes
+        self.unproven = "" if self.carries_serial else _UNPROVEN
         self.lidar_port = described.lidar_port
         self.imu_port = described.imu_port
         self.init_id = described.init_id
@@ -220,7 +256,7 @@ class OusterLidar:
         block = first // self.columns_per_packet
         rank = self._rank.take(block, mode="clip")
         inside = frame * self._packets_per_frame + rank
-        is_inside = rank >= 0
+        is_inside = (rank >= 0) & (block < len(self._rank))
         if is_inside.all():
             return inside
         return np.where(is_inside, inside, -1 - (frame * len(self._rank) + block))
@@ -289,11 +325,9 @@ def _headers(described: Metadata, check_crc: bool) -> Headers:
 
 
 def _column_period_ns(described: Metadata) -> float:
-    """Column period by the mode, such as 1024x10; 0 if the metadata have no mode."""
-    revolutions_per_s = described.lidar_mode.rpartition("x")[2]
-    if not revolutions_per_s.isdigit() or not int(revolutions_per_s):
-        return 0.0
-    return NS_PER_S / (described.columns_per_frame * int(revolutions_per_s))
+    """Column period by the mode; 0 if the metadata have no mode."""
+    columns_per_s = described.columns_per_frame * described.revolutions_per_s
+    return NS_PER_S / columns_per_s if columns_per_s else 0.0
 
 
 def _lit_share(described: Metadata) -> float:

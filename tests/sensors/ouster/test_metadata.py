@@ -29,7 +29,7 @@ def read(document: JsonObject) -> OusterCalibration:
 def reduced(product: str = "", mode: str = "1024x10", beams: int = 64) -> JsonObject:
     document: JsonObject = {
         "lidar_mode": mode,
-        "beam_altitude_angles": [float(beam) / 4 for beam in range(beams)],
+        "beam_altitude_angles": [-float(beam) / 4 for beam in range(beams)],
         "beam_azimuth_angles": [0.5] * beams,
     }
     return document | ({"prod_line": product} if product else {})
@@ -103,6 +103,17 @@ def test_error_texts_of_old_firmware_count_as_absent() -> None:
     assert read(document).lidar({}, None).mode == "1024x10 LEGACY"
 
 
+def test_altitudes_that_do_not_fall_are_noted() -> None:
+    document = metadata_json(SPEC)
+    angles = document["beam_intrinsics"]["beam_altitude_angles"]
+    # Neighbours of a calibrated unit, and two that were exchanged.
+    angles[5], angles[6] = angles[6] - 0.1, angles[6] + 0.1
+    assert read(document).lidar({}, None).notes == ()
+    angles[5], angles[25] = angles[25], angles[5]
+    (note,) = read(document).lidar({}, None).notes
+    assert "beam_altitude_angles: expected angles that fall from beam to beam, found" in note
+
+
 def test_old_firmware_sends_64_beams_for_16() -> None:
     lidar = read(reduced("OS-1-16-A0")).lidar({}, None)
     assert (lidar.channels, lidar.packet_size) == (64, 12608)
@@ -160,11 +171,11 @@ def test_the_order_of_two_returns(order: str | None, first: str) -> None:
 
 
 def test_beams_lifted_from_the_rotor_plane_and_a_turned_sensor() -> None:
-    # Beam 0 looks along x of the lidar frame at column 0: axis (2, 0, 1) mm, so n = sqrt(5) mm.
+    # Beam 1 looks along x of the lidar frame at column 0: axis (2, 0, 1) mm, so n = sqrt(5) mm.
     spec = OusterSpec(
         beams=2,
         columns_per_frame=512,
-        altitude_deg=(0.0, 90.0),
+        altitude_deg=(90.0, 0.0),
         azimuth_deg=(0.0, 0.0),
         beam_offset_mm=(2.0, 1.0),
         # A rotation by 90 degrees about z, then 100 mm up.
@@ -185,7 +196,7 @@ def test_beams_lifted_from_the_rotor_plane_and_a_turned_sensor() -> None:
         direction = cosine * table.direction[0] + sine * table.direction[1] + table.direction[2]
         origin = cosine * table.origin[0] + sine * table.origin[1] + table.origin[2]
         xyz = (1.0 + table.reach_m)[:, None] * direction + origin
-        np.testing.assert_allclose(xyz, [level, up], atol=1e-12)
+        np.testing.assert_allclose(xyz, [up, level], atol=1e-12)
 
 
 def test_options_of_this_and_other_vendors() -> None:
@@ -265,6 +276,12 @@ MISTAKES: list[tuple[tuple[str, ...], object, str]] = [
         BEAMS,
         [1.0] * 63 + [1e5],
         "beam_altitude_angles: expected angles from -90 to 90 degrees, found 100000",
+    ),
+    (
+        BEAMS,
+        np.linspace(-16.0, 16.0, 64).tolist(),
+        "beam_altitude_angles: expected angles that fall .*, found -16 to 16 degrees, as if their "
+        "sign were turned",
     ),
     (BEAMS, [[1.0] * 64] * 4, "beam_altitude_angles: .*a unit that does not spin"),
     (AZIMUTHS, [1.0] * 63, "beam_azimuth_angles: expected 64 angles in degrees, found 63 entries"),
