@@ -7,6 +7,7 @@ from mlbatch.sensors.hesai.encode_angles import (
     Beams,
     MirrorAngles,
     angles_csv,
+    fan,
 )
 
-__all__ = ["Angles", "Beams", "MirrorAngles", "angles_csv"]
+__all__ = ["Angles", "Beams", "MirrorAngles", "angles_csv", "fan"]

@@ -31,6 +31,7 @@ RIGS: dict[str, tuple[str, ...]] = {
     ),
     "vlp16": ("name: top, model: VLP-16",),
     "vlp32c": ("name: top, model: VLP-32C",),
+    "hdl32e_yml": ("name: top, model: VLP-32C, metadata: files/hdl32e.yml",),
     "vlp32c_yml": ("name: top, metadata: files/vlp32c.yml",),
     "vlp61": ("name: top, model: VLP-61",),
     "small": ("name: top, model: vls-128",),
@@ -61,6 +62,27 @@ VENDOR_MISTAKES: dict[str, tuple[str, int, str]] = {
         "xt16_bare/drive.pcap: 10.0.0.8 > port 2368 carries HESAI lidar PandarXT-16, strongest "
         "return; expected metadata that match, found only 32.csv; give the sensor's with "
         "--metadata FILE" + HESAI,
+    ),
+    "angles of another HESAI with as many channels": (
+        "qt64/drive.pcap --metadata files/p64.csv",
+        1,
+        "qt64/drive.pcap: 10.0.0.8 > port 2368: files/p64.csv: expected elevations of a "
+        "PandarQT64, -52.1 to 52.1 deg, found -24.9 to 14.9, the file of another model; give the "
+        "one of this lidar (without a match: p64.csv)",
+    ),
+    "angles of another ROBOSENSE with as many lines": (
+        "bpearl/drive.pcap --metadata files/rs32_other.csv",
+        1,
+        "bpearl/drive.pcap: 10.0.0.8 > port 6699: files/rs32_other.csv: expected elevations of a "
+        "RS-Bpearl v4, 0 to 90 deg, found -25.0 to 15.0, the file of another model; give the one "
+        "of this lidar (without a match: rs32_other.csv)",
+    ),
+    "angles of another Velodyne than the rig names": (
+        "vlp32c/drive.pcap --rig hdl32e_yml.yaml",
+        1,
+        "hdl32e_yml.yaml: sensor top: files/hdl32e.yml: Velodyne calibration: expected vertical "
+        "angles of a VLP-32C, which the rig names, found those of a HDL-32E; give the file of this "
+        "lidar, or correct the model",
     ),
     "angles of another vendor": (
         "xt16_bare/drive.pcap --metadata files/rs16.csv",

@@ -10,6 +10,7 @@ import pytest
 
 from tests.builders.bags import Recorded
 from tests.builders.hesai import DUAL, HesaiSpec
+from tests.builders.hesai_angles import angles_csv, fan
 from tests.builders.livox import LivoxSpec
 from tests.builders.others import EE, filled
 from tests.builders.points import CLOUD, OUSTER, cloud_message
@@ -41,6 +42,8 @@ from tests.cli.test_mistakes import check
 VLP16 = VelodyneSpec("VLP-16", start_us=BEGIN_US)
 XT16 = HesaiSpec("PandarXT-16")
 P40 = HesaiSpec("Pandar40P")
+QT64 = HesaiSpec("PandarQT64")
+BPEARL = RobosenseSpec("Bpearl v4")
 HELIOS = RobosenseSpec("Helios 16")
 # Packets that suffice to be recognised, and those of more than a few windows.
 FEW = 20
@@ -81,7 +84,7 @@ def _write_velodyne(folder: Path) -> None:
     changed = many + velodyne_payloads(dual, MANY)
     write_capture(folder / "changed", framed(changed, IP, PORT))
     (folder / "files").mkdir()
-    for name, model in (("vlp16", "VLP-16"), ("vlp32c", "VLP-32C")):
+    for name, model in (("vlp16", "VLP-16"), ("vlp32c", "VLP-32C"), ("hdl32e", "HDL-32E")):
         (folder / "files" / f"{name}.yml").write_text(calibration_yaml(model), encoding="utf-8")
     cut = calibration_yaml("VLP-16")[:400]
     (folder / "files" / "cut.yml").write_text(cut, encoding="utf-8")
@@ -113,6 +116,8 @@ def _write_hesai(folder: Path) -> None:
     write_capture(folder / "xt16_twins", framed(few, IP, PORT), framed(few, OTHER_IP, PORT))
     hesai_csv(folder / "xt16_twins" / "16.csv", 16)
     hesai_csv(folder / "files" / "xt16.csv", 16)
+    write_capture(folder / "qt64", framed(hesai_payloads(QT64, FEW), IP, PORT))
+    (folder / "files" / "p64.csv").write_bytes(angles_csv(*fan("Pandar64", 64)))
     gps = filled(512, {0: EE + b"712190403180", 18: b"$GPRMC"})
     write_capture(folder / "gps", framed([(BEGIN_NS, gps)], IP, 10110))
     many = hesai_payloads(XT16, MANY)
@@ -134,6 +139,9 @@ def _write_robosense(folder: Path) -> None:
     write_capture(folder / "helios_bare", framed(many[:FEW], IP, RS_PORT))
     write_capture(folder / "helios", framed(many, IP, RS_PORT), framed(device, IP, DIFOP_PORT))
     write_capture(folder / "difop", framed(device, IP, DIFOP_PORT))
+    write_capture(folder / "bpearl", framed(robosense_payloads(BPEARL, FEW), IP, RS_PORT))
+    other = "".join(f"{15 - n * 40 / 31:.3f},0\n" for n in range(32))
+    (folder / "files" / "rs32_other.csv").write_text(other, encoding="utf-8")
     robosense_csv(folder / "files" / "rs15.csv", 15)
     robosense_csv(folder / "files" / "rs16.csv", 16)
     robosense_csv(folder / "files" / "rs32.csv", 32)

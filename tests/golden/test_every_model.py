@@ -21,7 +21,7 @@ from mlbatch.pipeline.job import Job
 from mlbatch.types import Scan
 from tests.builders import hesai, hesai_models, robosense, robosense_models, velodyne
 from tests.builders.captures import udp_frame, write_pcap
-from tests.builders.hesai_angles import Angles, Beams, MirrorAngles, angles_csv
+from tests.builders.hesai_angles import Angles, Beams, MirrorAngles, angles_csv, fan
 from tests.builders.run import Result, in_memory
 from tests.builders.scene import hall
 from tests.builders.seen import (
@@ -87,18 +87,12 @@ def velodyne_sent(model: str, mode: str, name: str = "") -> Sent:
     return Sent(name or model, sight, types, is_named=bool(name))
 
 
-# Models that differ in their angles only.
-HESAI_BEAMS_DEG = {"Pandar20A": (7.9, -24.9), "Pandar20B": (2.9, -18.9)}
-
-
 def hesai_sent(model: str, mode: str, operation: str = hesai_models.HIGH) -> Sent:
     """mode: byte of the return mode; operation: of models with protocol 1.4."""
     # All columns of an AT128 lie within the field of one mirror.
     spec = hesai.HesaiSpec(model, int(mode, 16), start_deg=351.3, operation=operation)
     channels = spec.row.channels
-    highest, lowest = HESAI_BEAMS_DEG.get(model, (14.9, -15.1))
-    elevation = np.round(np.linspace(highest, lowest, channels), 3).tolist()
-    azimuth = np.round(np.linspace(-4, 4, channels), 3).tolist()
+    elevation, azimuth = fan(model, channels)
     beams: Beams = Angles(elevation, azimuth)
     file = "unit.csv"
     content = angles_csv(elevation, azimuth)

@@ -20,7 +20,7 @@ from mlbatch.discovery.match import best_fits, match
 from mlbatch.lidar.interface import Calibration, ModelFile
 from mlbatch.sensors import parse_calibration
 from tests.builders import hesai, hesai_models, robosense, robosense_models, velodyne
-from tests.builders.hesai_angles import MirrorAngles, angles_csv
+from tests.builders.hesai_angles import MirrorAngles, angles_csv, fan
 from tests.builders.loss import Came
 from tests.builders.velodyne_tables import MODELS as VELODYNES
 from tests.builders.velodyne_tables import calibration_yaml
@@ -71,8 +71,7 @@ def hesais(model: str, mode: str, flags: str) -> Spoken:
         hesai.encode_packets(spec, nothing),
         strict=True,
     )
-    elevation = np.linspace(14.9, -15.1, row.channels).round(3).tolist()
-    azimuth = [0.0] * row.channels
+    elevation, azimuth = fan(model, row.channels)
     if model == "AT128":
         mirrors = MirrorAngles((20.0, 140.0, 260.0), elevation, azimuth)
         return Spoken(list(rows), (), "unit.dat", mirrors.dat())

@@ -59,6 +59,30 @@ class MirrorAngles:
         return body + hashlib.sha256(body).digest()
 
 
+# Highest and lowest beam by the data sheets, deg; of other models as of a PandarXT-16.
+_SPAN_DEG = (14.9, -15.1)
+_WIDE_DEG = (14.9, -24.9)
+_SPANS_DEG = {
+    "Pandar20A": (7.9, -24.9),
+    "Pandar20B": (2.9, -18.9),
+    "Pandar40P": _WIDE_DEG,
+    "Pandar40M": _WIDE_DEG,
+    "Pandar64": _WIDE_DEG,
+    "Pandar64-7": _WIDE_DEG,
+    "PandarQT64": (52.1, -52.1),
+    "QT128C2X": (52.6, -52.6),
+    "XT32M2X": (19.5, -20.8),
+    "Pandar128E3X": _WIDE_DEG,
+    "OT128": _WIDE_DEG,
+}
+
+
+def fan(model: str, channels: int) -> tuple[list[float], list[float]]:
+    """Elevations and azimuths of a made-up unit, deg: evenly spread."""
+    elevation = np.linspace(*_SPANS_DEG.get(model, _SPAN_DEG), channels)
+    return elevation.round(3).tolist(), np.linspace(-4.0, 4.0, channels).round(3).tolist()
+
+
 def angles_csv(elevation_deg: Sequence[float], azimuth_deg: Sequence[float]) -> bytes:
     """The angle file of a unit."""
     rows = enumerate(zip(elevation_deg, azimuth_deg, strict=True), 1)

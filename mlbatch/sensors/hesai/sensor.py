@@ -27,6 +27,7 @@ from mlbatch.sensors.hesai.layout import Layout
 from mlbatch.sensors.hesai.models import Model
 from mlbatch.sensors.hesai.optics import OffAxis, off_axis
 from mlbatch.sensors.hesai.packets import PacketReader
+from mlbatch.sensors.nominal import apart_deg, refuse_other_beams
 from mlbatch.sensors.options import check_options
 from mlbatch.types import ColumnHeaders, Pixels
 from mlbatch.units import M_PER_MM, RAD_PER_DEG
@@ -105,6 +106,9 @@ class HesaiCalibration:
                 f"{self.path}: HESAI angles: expected {model.channels} channels for the packets "
                 f"of a {model.name}, found {len(angles.azimuth_rad)}; give the file of this lidar"
             )
+        if model.elevation_deg is not None:
+            elevation_deg = angles.elevation_rad / RAD_PER_DEG
+            refuse_other_beams(self.path, model.name, elevation_deg, [model.elevation_deg])
         centre = np.array(model.centre_mm) * M_PER_MM if _is_on(options, "optical_centre") else None
         lidar = HesaiLidar(layout, options, evidence, angles, centre)
         note = _note_on_beams(angles, model)
@@ -257,14 +261,13 @@ def _note_on_beams(angles: HesaiAngles, model: Model) -> str:
     """Note on elevations of a file that do not fit a model, or ""."""
     if model.elevation_deg is None:
         return ""
-    got_deg = angles.elevation_rad.min() / RAD_PER_DEG, angles.elevation_rad.max() / RAD_PER_DEG
-    pairs = zip(got_deg, model.elevation_deg, strict=True)
-    if all(abs(found - expected) <= _ELEVATION_TOLERANCE_DEG for found, expected in pairs):
+    found_deg = angles.elevation_rad / RAD_PER_DEG
+    if apart_deg(found_deg, model.elevation_deg) <= _ELEVATION_TOLERANCE_DEG:
         return ""
     return (
         f"{angles.path}: expected elevations from about {model.elevation_deg[0]:g} to "
-        f"{model.elevation_deg[1]:g} deg for a {model.name}, found {got_deg[0]:.1f} to "
-        f"{got_deg[1]:.1f}; check that the file is of this lidar"
+        f"{model.elevation_deg[1]:g} deg for a {model.name}, found {found_deg.min():.1f} to "
+        f"{found_deg.max():.1f}; check that the file is of this lidar"
     )
 
 

@@ -27,7 +27,7 @@ from mlbatch.sensors.hesai.encode import (
     firing_times_ns,
     packet_times_ns,
 )
-from mlbatch.sensors.hesai.encode_angles import Angles, Beams, MirrorAngles, angles_csv
+from mlbatch.sensors.hesai.encode_angles import Angles, Beams, MirrorAngles, angles_csv, fan
 from mlbatch.sensors.hesai.encode_models import MODELS as ROWS
 from mlbatch.units import NS_PER_S, RAD_PER_DEG
 
@@ -36,9 +36,6 @@ _MODES = {"strongest": 0x37, "last": 0x38, "dual": 0x39}
 _LARGEST = 65535
 # A multiple of the packets after which times are whole ns (3) and firing tables repeat (4).
 _CHUNK_PACKETS = 60
-# Highest and lowest beam, deg; of models with other fields of view.
-_SPAN_DEG = (14.9, -15.1)
-_SPANS_DEG = {"Pandar20A": (7.9, -24.9), "Pandar20B": (2.9, -18.9)}
 _MIRROR_STARTS_DEG = (20.0, 140.0, 260.0)
 # Azimuths in which an AT128 measures, from the middle of a mirror's field.
 _HALF_VIEW_DEG = 60.0
@@ -77,9 +74,7 @@ class SimulatedHesai:
             start_ns=settings.start_ns,
         )
         row = self._spec.row
-        span = _SPANS_DEG.get(settings.model, _SPAN_DEG)
-        elevation = np.round(np.linspace(*span, row.channels), 3).tolist()
-        azimuth = np.round(np.linspace(-4.0, 4.0, row.channels), 3).tolist()
+        elevation, azimuth = fan(settings.model, row.channels)
         self._beams: Beams = Angles(elevation, azimuth)
         self.files = LidarFiles("csv", angles_csv(elevation, azimuth))
         self._has_mirrors = settings.model == "AT128"

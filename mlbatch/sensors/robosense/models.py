@@ -138,6 +138,8 @@ class Model:
     range_mask: their bits.
     lens_m: radius and height of the lens.
     nominal_deg: elevations to assume without the unit's.
+    spans_deg: lowest and highest beam by the data sheets, of each variant; empty where all models
+        with as many channels have the same.
     mirrors: azimuths count backwards if the rotor is set to reverse (DIFOP byte 337).
     has_sync: DIFOP bytes 301 and 302 are the state of synchronisation.
     """
@@ -158,6 +160,7 @@ class Model:
     is_calendar: bool = False
     range_mask: int = 0xFFFF
     nominal_deg: tuple[float, ...] = ()
+    spans_deg: tuple[tuple[float, float], ...] = ()
     counter_at: int = 0
     mirrors: bool = False
     has_sync: bool = True
@@ -180,6 +183,8 @@ _BPEARL_V4_DEG = (
     36.02, 81.07, 38.84, 83.89, 41.66, 86.71, 44.47, 89.55,
 )
 # fmt: on
+_TO_15_DEG = (-25.0, 15.0)
+_HEMISPHERE_DEG = (0.0, 90.0)
 _DUAL = ReturnMode(2, OTHER)
 _STRONGEST = ReturnMode(1, STRONGEST, "strongest")
 _LAST = ReturnMode(1, LAST, "last")
@@ -233,6 +238,7 @@ RS32 = replace(
     firing_ns=(tuple(2880 * ((k - 1) % 16) + 1440 * (k // 16) for k in range(1, 33)),),
     lens_m=(0.03997, 0.0),
     angles=AngleOffsets(468, 564, 0.001),
+    spans_deg=(_TO_15_DEG,),
 )
 BPEARL_V3 = replace(
     RS32,
@@ -242,6 +248,7 @@ BPEARL_V3 = replace(
     ),
     lens_m=(0.01473, 0.09427),
     angles=AngleOffsets(468, 564, 0.01),
+    spans_deg=(_HEMISPHERE_DEG,),
     counter_at=12,
     has_sync=True,
     mirrors=True,
@@ -266,6 +273,8 @@ HELIOS_32 = Model(
     units_per_m=400,
     lens_m=(0.03498, 0.0),
     angles=AngleOffsets(468, 564, 0.01),
+    # 5515, 1615 and 1610.
+    spans_deg=((-55.0, 15.0), (-16.0, 15.0), (-16.0, 10.0)),
     modes=_NEW_MODES,
     verified="two sources",
 )
@@ -273,6 +282,7 @@ HELIOS_16 = replace(
     HELIOS_32,
     name="Helios 16",
     channels=16,
+    spans_deg=(),
     # By the manual: the upper half of a 32-line round. The driver begins at 0.
     firing_ns=(tuple(27_680 + 1730 * k for k in range(16)),),
     verified="one source",
@@ -296,6 +306,7 @@ AIRY_48 = replace(
     name="Airy 48",
     channels=48,
     firing_ns=(_AIRY_48_NS,),
+    spans_deg=(_HEMISPHERE_DEG,),
     verified="one source",
 )
 RUBY_128 = Model(
@@ -318,7 +329,12 @@ RUBY_80 = replace(
     firing_ns=(_RUBY_80_NS,),
 )
 RUBY_48 = replace(
-    RUBY_80, name="Ruby 48", layout=RUBY_48_LAYOUT, channels=48, firing_ns=(_RUBY_48_NS,)
+    RUBY_80,
+    name="Ruby 48",
+    layout=RUBY_48_LAYOUT,
+    channels=48,
+    firing_ns=(_RUBY_48_NS,),
+    spans_deg=(_TO_15_DEG,),
 )
 RUBY_PLUS_128 = replace(
     RUBY_128,
@@ -344,6 +360,7 @@ RUBY_PLUS_48 = replace(
     layout=RUBY_48_LAYOUT,
     channels=48,
     firing_ns=(_RUBY_PLUS_48_NS,),
+    spans_deg=(_TO_15_DEG,),
 )
 ROWS = (
     RS16,

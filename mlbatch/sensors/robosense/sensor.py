@@ -19,6 +19,7 @@ from mlbatch.errors import RigError
 from mlbatch.lidar.geometry import BeamTable, spherical
 from mlbatch.lidar.interface import NAMED_ONLY, Calibration, Evidence, SensorModel
 from mlbatch.sensors.base import BaseLidar
+from mlbatch.sensors.nominal import refuse_other_beams
 from mlbatch.sensors.options import check_options
 from mlbatch.sensors.packet_bytes import majority, number
 from mlbatch.sensors.robosense.difop import (
@@ -178,6 +179,7 @@ class CsvCalibration:
                 f"found {describe(evidence.size, evidence.sample) or 'others'}; give the csv of "
                 "its unit"
             )
+        refuse_other_beams(self.path, row.name, self._angles.elevation_deg, row.spans_deg)
         difop = find_difop(evidence)
         found = identify_unit(evidence)
         # The number of lines decides as well.

@@ -118,6 +118,8 @@ class VelodyneCalibration:
         has_heights = chosen["vertical_offset"] == "on"
         measured, notes = _measure(self.row, evidence)
         file = self.file
+        if file is not None and self.is_named:
+            _refuse_other_beams(self.row, file)
         if file is not None:
             notes += [*file.notes, *_file_notes(self)]
             if has_heights and self.row.height_mm and not file.vert_offset_m.any():
@@ -145,10 +147,7 @@ def read_calibration(path: Path, content: bytes) -> VelodyneCalibration | None:
     file = read_velodyne(path, content)
     if file is None:
         return None
-    rows = [row for row in ALL if row.lasers == file.lasers]
-    difference_deg, row = min(
-        ((_difference_deg(row, file), row) for row in rows), key=lambda pair: pair[0]
-    )
+    difference_deg, row = _nearest(file)
     if difference_deg > _ANGLE_TOLERANCE_DEG:
         raise RigError(
             f"{path}: Velodyne calibration: expected vertical angles of {row.name} or another "
@@ -156,6 +155,23 @@ def read_calibration(path: Path, content: bytes) -> VelodyneCalibration | None:
             f"{difference_deg:.1f} degrees; give the file of a supported model"
         )
     return VelodyneCalibration(row, file, is_guessed=row.needs_file)
+
+
+def _nearest(file: VelodyneFile) -> tuple[float, Model]:
+    """Mean elevation difference to the model with the nearest angles, and this model."""
+    rows = [row for row in ALL if row.lasers == file.lasers]
+    return min(((_difference_deg(row, file), row) for row in rows), key=lambda pair: pair[0])
+
+
+def _refuse_other_beams(row: Model, file: VelodyneFile) -> None:
+    """Raise RigError if the angles of a file are nearest to those of another model."""
+    _, nearest = _nearest(file)
+    if nearest.elevation_deg != row.elevation_deg:
+        raise RigError(
+            f"{file.path}: Velodyne calibration: expected vertical angles of a {row.name}, which "
+            f"the rig names, found those of a {nearest.name}; give the file of this lidar, or "
+            "correct the model"
+        )
 
 
 def _difference_deg(row: Model, file: VelodyneFile) -> float:

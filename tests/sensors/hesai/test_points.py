@@ -15,8 +15,7 @@ import numpy as np
 import pytest
 
 from mlbatch.arrays import U8Array
-from tests.builders.hesai import angles_csv
-from tests.builders.hesai_angles import MirrorAngles
+from tests.builders.hesai_angles import MirrorAngles, angles_csv, fan
 from tests.builders.hesai_decoded import decode, rows
 
 # 2023-06-15 12:30:45.678901 UTC; `date -u -d 2023-06-15T12:30:45 +%s` says 1686832245.
@@ -275,20 +274,36 @@ def _packet(case: Case) -> bytes:
     return bytes(packet)
 
 
+_ELEVATION_DEG = 10.0
+# Of beams that the packets leave dark, where the field of view of a model ends.
+_LIMITS_DEG = {
+    "Pandar20A": (8.0, -25.0),
+    "PandarQT64": (52.1, -52.1),
+    "QT128C2X": (52.6, -52.6),
+    "XT32M2X": (19.5, -20.8),
+}
+_DOWN_TO_DEG = {"PandarXT-16": -15.0, "PandarXT-32": -16.0}
+
+
 def _point(azimuth_deg: float, range_m: float) -> tuple[float, float, float]:
-    flat_m, azimuth = range_m * math.cos(math.radians(30)), math.radians(azimuth_deg)
-    return flat_m * math.sin(azimuth), flat_m * math.cos(azimuth), range_m / 2
+    elevation, azimuth = math.radians(_ELEVATION_DEG), math.radians(azimuth_deg)
+    flat_m = range_m * math.cos(elevation)
+    return flat_m * math.sin(azimuth), flat_m * math.cos(azimuth), range_m * math.sin(elevation)
 
 
-def _csv(channels: int) -> bytes:
-    return angles_csv([30.0] * channels, [1.0] * channels)
+def _csv(case: Case) -> bytes:
+    elevation_deg = [_ELEVATION_DEG] * case.channels
+    dark = sorted(set(range(case.channels)) - {shot.channel for shot in case.shots})
+    usual = (15.0, _DOWN_TO_DEG.get(case.model, -25.0))
+    elevation_deg[dark[0]], elevation_deg[dark[-1]] = _LIMITS_DEG.get(case.model, usual)
+    return angles_csv(elevation_deg, [1.0] * case.channels)
 
 
 @pytest.mark.parametrize("turning", [True, False], ids=["turning", "still"])
 @pytest.mark.parametrize("case", CASES, ids=lambda case: f"{case.model}-{case.size}-{case.mode:x}")
 def test_hand_worked_points(case: Case, turning: bool) -> None:
     options = {} if turning else {"firing_azimuth": "off"}
-    found = decode(rows([_packet(case)] * 2), _csv(case.channels), options)
+    found = decode(rows([_packet(case)] * 2), _csv(case), options)
     assert found.lidar.model == case.model
     # Nothing else came back, in either of the two packets.
     assert np.count_nonzero(found.range_m) == 2 * len(case.shots)
@@ -322,7 +337,7 @@ def test_azimuths_of_an_xt_as_in_the_vendors_sdk(
     for channel in range(case.channels):
         struct.pack_into("<H", packet, 14 + 4 * channel, 10_000)
     packets = rows([bytes(packet)] * 2)
-    found = decode(packets, angles_csv([0.0] * case.channels, [0.0] * case.channels))
+    found = decode(packets, angles_csv(fan(model, case.channels)[0], [0.0] * case.channels))
     xyz = found.xyz()[0, :, 0]
     azimuth_deg = np.degrees(np.arctan2(xyz[:, 0], xyz[:, 1]))
     number = np.arange(case.channels) % together
@@ -336,7 +351,7 @@ def test_azimuths_of_an_xt_as_in_the_vendors_sdk(
 
 
 def test_a_column_is_stamped_at_its_earliest_firing() -> None:
-    found = decode(rows([_packet(CASES[0])] * 2), _csv(40))
+    found = decode(rows([_packet(CASES[0])] * 2), _csv(CASES[0]))
     # Channel 8 of a Pandar40P is the first to fire, 54670 ns before the block's end.
     assert found.stamp_ns[9] == PACKET_NS - 28580 - 54670
     assert found.lidar.firing_ns.shape == (1, 40)
@@ -344,7 +359,7 @@ def test_a_column_is_stamped_at_its_earliest_firing() -> None:
 
 
 def test_channels_that_a_loop_leaves_out() -> None:
-    lidar = decode(rows([_packet(CASES[5])] * 2), _csv(128)).lidar
+    lidar = decode(rows([_packet(CASES[5])] * 2), _csv(CASES[5])).lidar
     assert (lidar.firing_ns[0] == -1).nonzero()[0].tolist() == list(range(32))
     assert (lidar.firing_ns[1] == -1).nonzero()[0].tolist() == list(range(32, 64))
 
@@ -354,7 +369,7 @@ def test_small_numbers_of_an_ot128_are_words(raw: int, range_m: float) -> None:
     case = next(case for case in CASES if case.model == "OT128")
     packet = bytearray(_packet(case))
     struct.pack_into("<H", packet, case.shots[1].at, raw)
-    found = decode(rows([bytes(packet)] * 2), _csv(128))
+    found = decode(rows([bytes(packet)] * 2), _csv(case))
     assert found.range_m[1, 2, 0] == np.float32(range_m)
 
 
@@ -367,7 +382,7 @@ def test_ranges_are_correctly_rounded(unit_mm: int) -> None:
     for block, values in enumerate(raw.tolist()):
         for channel, value in enumerate(values):
             struct.pack_into("<H", packet, 14 + 130 * block + 4 * channel, value)
-    found = decode(rows([bytes(packet)] * 2), _csv(32))
+    found = decode(rows([bytes(packet)] * 2), _csv(case))
     # A quotient of float64 is so close that rounding it again hits the nearest float32.
     assert (found.range_m[:8, :, 0] == (raw * unit_mm / 1000).astype(np.float32)).all()
 
@@ -389,7 +404,7 @@ def _at128(mode: int, shots: list[tuple[int, int, int]]) -> U8Array:
 
 
 def test_hand_worked_points_of_an_at128() -> None:
-    dat = MirrorAngles((20.0, 140.0, 260.0), [30.0] * 128, [1.0] * 128).dat()
+    dat = MirrorAngles((20.0, 140.0, 260.0), [_ELEVATION_DEG] * 128, [1.0] * 128).dat()
     packets = _at128(0x37, [(12 + 3 + 8, 2501, 1), (12 + 515 + 3, 2502, 2), (530 + 508, 2503, 3)])
     found = decode(packets, dat)
     assert (found.lidar.model, found.lidar.channels) == ("AT128", 128)
@@ -411,7 +426,7 @@ def test_hand_worked_points_of_an_at128() -> None:
 
 
 def test_two_returns_of_an_at128() -> None:
-    dat = MirrorAngles((20.0, 140.0, 260.0), [30.0] * 128, [1.0] * 128).dat()
+    dat = MirrorAngles((20.0, 140.0, 260.0), [_ELEVATION_DEG] * 128, [1.0] * 128).dat()
     found = decode(_at128(0x39, [(15, 2501, 1), (530, 2502, 2)]), dat)
     assert found.range_m[0, 0].tolist() == [np.float32(10.004), np.float32(10.008)]
     assert found.time_ns[0, 0] == PACKET_NS - 50915

@@ -15,8 +15,8 @@ from mlbatch.lidar.interface import FAULTS
 from mlbatch.sensors import crc
 from mlbatch.sensors.hesai import sensor as hesai
 from tests.builders import hesai as builder
-from tests.builders.hesai import HesaiSpec, angles_csv, encode_packets
-from tests.builders.hesai_angles import Angles, Beams, MirrorAngles
+from tests.builders.hesai import HesaiSpec, encode_packets
+from tests.builders.hesai_angles import Angles, Beams, MirrorAngles, angles_csv, fan
 from tests.builders.hesai_decoded import calibration, decode, evidence, rows
 
 COLUMNS = 420
@@ -33,9 +33,9 @@ MODES = (
 
 
 def _beams(channels: int, model: str = "") -> tuple[Beams, bytes]:
-    """Some beams, and their file."""
-    elevation = np.round(np.linspace(14.9, -24.9, channels), 3).tolist()
-    azimuth = np.round(np.linspace(-4, 4, channels), 3).tolist()
+    """Some beams, and their file; model: by default one of as many channels."""
+    usual = {32: "PandarXT-32", 40: "Pandar40P", 64: "Pandar64", 128: "OT128"}
+    elevation, azimuth = fan(model or usual.get(channels, ""), channels)
     if model == "AT128":
         beams = MirrorAngles((20.0, 140.0, 260.0), elevation, azimuth)
         return beams, beams.dat()
@@ -96,7 +96,7 @@ def test_a_rotor_that_turns_the_other_way(model: str) -> None:
     tail = {"Pandar64": 1180, "PandarXT-32": 1063, "QT128C2X": 1074}[model]
     packets = packets.copy()
     packets[:, tail : tail + 2] = np.frombuffer(struct.pack("<H", 600), np.uint8)
-    beams, content = _beams(spec.row.channels)
+    beams, content = _beams(spec.row.channels, spec.model)
     found = decode(packets, content)
     fired = builder.fires(spec, len(found.stamp_ns))
     expected = found.range_m[..., None] * builder.directions(spec, beams, len(fired))[:, :, None, :]
@@ -229,7 +229,7 @@ def test_dual_modes_may_change_but_not_the_number_or_type_of_returns() -> None:
 )
 def test_return_types(mode: int, types: tuple[int, ...], text: str) -> None:
     packets, _, _ = _encoded(HesaiSpec("XT32M2X", mode=mode))
-    lidar = calibration(_beams(32)[1]).lidar({}, evidence(packets))
+    lidar = calibration(_beams(32, "XT32M2X")[1]).lidar({}, evidence(packets))
     assert (lidar.return_types, lidar.mode) == (types, text)
 
 
@@ -303,10 +303,17 @@ def test_fit_is_by_channels_then_by_where_beams_look() -> None:
     assert calibration(_beams(40)[1]).match_score(seen) == 0
     assert calibration(_beams(128, "AT128")[1]).match_score(seen) == 0
     assert own.lidar({}, seen).notes == ()
-    (note,) = qt64.lidar({}, seen).notes
+    with pytest.raises(RigError) as caught:
+        qt64.lidar({}, seen)
+    assert str(caught.value) == (
+        "unit.csv: expected elevations of a Pandar64, -25 to 15 deg, found -52.1 to 52.1, the file "
+        "of another model; give the one of this lidar"
+    )
+    near = calibration(angles_csv(np.linspace(19.5, -24.9, 64).tolist(), [0.0] * 64))
+    (note,) = near.lidar({}, seen).notes
     assert note == (
-        "unit.csv: expected elevations from about -25 to 15 deg for a Pandar64, found -52.1 to "
-        "52.1; check that the file is of this lidar"
+        "unit.csv: expected elevations from about -25 to 15 deg for a Pandar64, found -24.9 to "
+        "19.5; check that the file is of this lidar"
     )
 
 
