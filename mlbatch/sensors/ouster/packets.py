@@ -123,10 +123,7 @@ class LegacyHeaders(NamedTuple):
         return np.ones(len(packets), np.bool_)
 
     def faults(self, packets: U8Array) -> U8Array:
-        """`bad_header` unless the valid columns of a packet are neighbours in one frame.
-
-        Ids beyond the frame are of another mode than that of the metadata.
-        """
+        """`bad_header` unless the valid columns of a packet are neighbours in one frame."""
         columns = self._columns(packets)
         measured = self._measured(packets)
         frame = columns["frame_id"].astype(np.int64)
@@ -135,8 +132,8 @@ class LegacyHeaders(NamedTuple):
         same = (frame == np.take_along_axis(frame, first, 1)) & (
             block == np.take_along_axis(block, first, 1)
         )
-        beyond = columns["measurement_id"] >= self.columns_per_frame
-        bad = (measured & (~same | beyond)).any(axis=1)
+        bad = (measured & ~same).any(axis=1)
+        bad |= _are_beyond(columns["measurement_id"], measured, self.columns_per_frame)
         return np.where(bad, BAD_HEADER, 0).astype(np.uint8)
 
     def frame_ids(self, packets: U8Array) -> I64Array:
@@ -224,13 +221,10 @@ class PacketHeaders(NamedTuple):
         return np.asarray(owned | (found == 0) | (self.serial == 0))
 
     def faults(self, packets: U8Array) -> U8Array:
-        """(P,) `bad_header` for other packets, `bad_crc` for changed ones if `check_crc`.
-
-        Ids beyond the frame are of another mode than that of the metadata.
-        """
+        """(P,) `bad_header` for other packets, `bad_crc` for changed ones if `check_crc`."""
         columns = self._columns(packets)
-        beyond = columns["measurement_id"] >= self.columns_per_frame
-        bad = (beyond & ((columns["status"] & 1) != 0)).any(axis=1)
+        measured = (columns["status"] & 1) != 0
+        bad = _are_beyond(columns["measurement_id"], measured, self.columns_per_frame)
         bad |= self._read(packets, "packet_type") != LIDAR_PACKET
         verdict: U8Array = bad * np.uint8(BAD_HEADER)
         if self.check_crc and self.header == STANDARD:
@@ -269,6 +263,13 @@ class PacketHeaders(NamedTuple):
         other = FUSA if self.header == STANDARD else STANDARD
         moved = ~here & (_header_field(packets, HEADERS[other], "serial") == self.serial)
         return np.where(moved, _header_field(packets, HEADERS[other], field), value)
+
+
+def _are_beyond(mid: I64Array, measured: BoolArray, columns_per_frame: int) -> BoolArray:
+    """(P,) True for packets of another mode: no valid column (P, C) is within the frame."""
+    within = (measured & (mid < columns_per_frame)).any(axis=1)
+    result: BoolArray = np.asarray(~within & measured.any(axis=1), np.bool_)
+    return result
 
 
 def _header_field(packets: U8Array, header: HeaderLayout, field: str) -> I64Array:
