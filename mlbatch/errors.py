@@ -2,10 +2,23 @@
 
 from __future__ import annotations
 
+import errno
+
 # Messages may quote untrusted files: longer lines lose their middle.
 _MOST_CHARACTERS = 1600
 _FIRST_CHARACTERS = 1000
 _LAST_CHARACTERS = 500
+
+_REMEDIES = {
+    errno.ENOSPC: "free space on this disk or choose another output",
+    errno.EDQUOT: "free space in your quota or choose another output",
+    errno.EFBIG: "raise the limit of file sizes or choose another disk",
+    errno.EACCES: "choose an output where you may write",
+    errno.EPERM: "choose an output where you may write",
+    errno.EROFS: "choose an output on a disk that is not read-only",
+    errno.ENAMETOOLONG: "choose a shorter name",
+    errno.EMFILE: "raise the limit of open files (ulimit -n)",
+}
 
 
 class MlbatchError(Exception):
@@ -54,6 +67,25 @@ class ExportError(MlbatchError):
 
 class Interrupted(MlbatchError):
     """An interrupted run that `--resume` can continue (exit code 130)."""
+
+
+def write_error(path: object, err: OSError) -> ExportError:
+    """The error for a fault of the system while a path is written."""
+    remedy = _REMEDIES.get(err.errno or 0, "check the disk and the name of the output")
+    found = err.strerror or str(err)
+    return ExportError(f"{path}: expected to write it, found {found!r}; {remedy}")
+
+
+def system_error(err: OSError) -> MlbatchError:
+    """The error for a fault of the system that nobody has worded.
+
+    Those of files have their path, or are worded where the file is written.
+    """
+    remedy = _REMEDIES.get(err.errno or 0, "check the path and the disk")
+    # Not all have a number.
+    found = err.strerror or str(err) or type(err).__name__
+    place = err.filename or "standard output or another stream"
+    return MlbatchError(f"{place}: expected to read or write it, found {found!r}; {remedy}")
 
 
 def one_line(text: str) -> str:

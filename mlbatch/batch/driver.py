@@ -11,7 +11,7 @@ from queue import Empty, SimpleQueue
 
 from mlbatch.batch.record import FAILED, SessionRecord
 from mlbatch.batch.task import Stop, Task, finished, run_session
-from mlbatch.errors import Interrupted, MlbatchError
+from mlbatch.errors import Interrupted, MlbatchError, system_error
 
 SKIPPED = "skipped"
 # Requests to a store at the same time.
@@ -108,6 +108,8 @@ def _before(task: Task) -> SessionRecord | None:
 def failure(task: Task, err: Exception) -> Result:
     """The result of a session that could not be run; it is not in its folder."""
     name = task.session.name
+    if isinstance(err, OSError):
+        err = system_error(err)
     line = str(err) if isinstance(err, MlbatchError) else f"{type(err).__name__}: {err}"
     record = SessionRecord(name, FAILED, 1, line, {}, inputs=[*task.session.inputs])
     return Result(name, record, ran=True)

@@ -13,6 +13,7 @@ from pathlib import Path
 
 import mlbatch
 from mlbatch.batch.session import Session, is_url
+from mlbatch.bounded import open_file, read_bytes
 from mlbatch.errors import MlbatchError, RecordingError
 
 CONTENT = "content"
@@ -103,7 +104,7 @@ def _remote(inputs: Sequence[str]) -> Iterator[str]:
 def _samples(file: Path) -> Iterator[bytes]:
     size = file.stat().st_size
     step = max((size - _END_BYTES) // _BLOCKS, _END_BYTES)
-    with file.open("rb", buffering=0) as opened:
+    with open_file(file) as opened:
         for start in (*range(0, size, step), max(size - _END_BYTES, 0)):
             opened.seek(start)
             yield opened.read(_END_BYTES)
@@ -111,7 +112,7 @@ def _samples(file: Path) -> Iterator[bytes]:
 
 def _digest(file: Path) -> str:
     try:
-        return hashlib.sha256(file.read_bytes()).hexdigest()[:_DIGITS]
+        return hashlib.sha256(read_bytes(file)).hexdigest()[:_DIGITS]
     except OSError:
         # `convert` names what is wrong with it.
         return "unreadable"

@@ -7,6 +7,7 @@ from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 
 from mlbatch.batch.session import SESSION_JSON, STARTED_JSON
+from mlbatch.bounded import parse_json, read_text
 from mlbatch.writers import write_text
 
 SCHEMA = "mlbatch.session/1"
@@ -53,12 +54,12 @@ def read_record(folder: Path) -> SessionRecord | None:
 def parse_record(text: str) -> SessionRecord | None:
     """A record from its text; None for another text."""
     try:
-        found = json.loads(text)
+        found = parse_json(text)
         if found.pop("schema") != SCHEMA:
             return None
         known = {one.name for one in fields(SessionRecord)}
         record = SessionRecord(**{key: value for key, value in found.items() if key in known})
-    except (ValueError, TypeError, KeyError, AttributeError, RecursionError):
+    except (ValueError, TypeError, KeyError, AttributeError):
         return None
     is_valid = isinstance(record.key, dict) and record.state in (DONE, FAILED)
     return record if is_valid else None
@@ -74,7 +75,7 @@ def write_record(folder: Path, record: SessionRecord) -> None:
 def read_started(folder: Path) -> dict[str, str] | None:
     """The key of a run that has begun and not ended."""
     try:
-        found = json.loads(_text(folder / STARTED_JSON))
+        found = parse_json(_text(folder / STARTED_JSON))
     except ValueError:
         return None
     return found if isinstance(found, dict) else None
@@ -87,6 +88,6 @@ def write_started(folder: Path, key: dict[str, str]) -> None:
 
 def _text(path: Path) -> str:
     try:
-        return path.read_text(encoding="utf-8")
+        return read_text(path)
     except (OSError, UnicodeDecodeError):
         return ""

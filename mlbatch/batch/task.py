@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import contextlib
 import fcntl
-import json
 import os
 import shutil
 import signal
@@ -43,6 +42,7 @@ from mlbatch.batch.session import (
     is_url,
     own_files,
 )
+from mlbatch.bounded import parse_json, read_text
 from mlbatch.errors import ExportError, Interrupted, MlbatchError, one_line
 
 # Exit codes of `convert` that another attempt would not change, and that of a limit.
@@ -360,7 +360,7 @@ def _add_figures(record: SessionRecord, task: Task) -> None:
     for path in own_files(task.folder):
         if path.name.startswith("report") and path.suffix == ".json":
             with contextlib.suppress(OSError, ValueError, KeyError, TypeError):
-                fills += _add_report(record, json.loads(path.read_text(encoding="utf-8")))
+                fills += _add_report(record, parse_json(read_text(path)))
     record.fill = min(fills, default=None)
 
 

@@ -6,9 +6,9 @@ import atexit
 import gc
 import os
 import sys
-from typing import NoReturn
+from typing import NoReturn, TextIO
 
-from mlbatch.errors import Interrupted, MlbatchError, UsageError
+from mlbatch.errors import Interrupted, MlbatchError, UsageError, system_error
 
 # Otherwise numpy's linear algebra, which is not used, starts a thread on every core.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
@@ -27,12 +27,14 @@ def main() -> None:
     """Run the command line; exit codes: docs/commands.md."""
     gc.set_threshold(_BETWEEN_COLLECTIONS)
     atexit.register(gc.freeze)
+    _open_streams()
     try:
         from mlbatch.cli.app import command_line
 
         code = command_line(*sys.argv[1:2])(prog_name="mlbatch", standalone_mode=False)
         if code == EXIT_INTERRUPTED:
             raise KeyboardInterrupt
+        sys.stdout.flush()
         sys.exit(code)
     except UsageError as err:
         _fail(str(err), EXIT_USAGE)
@@ -44,8 +46,14 @@ def main() -> None:
         _fail("interrupted", EXIT_INTERRUPTED)
     except BrokenPipeError:
         # The reader of our output closed it: there is nowhere to print to.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        _leave(sys.stdout)
         sys.exit(EXIT_ERROR)
+    except OSError as err:
+        if os.environ.get("MLBATCH_TRACEBACK"):
+            raise
+        if err.filename is None:
+            _leave(sys.stdout)
+        _fail(str(system_error(err)), EXIT_ERROR)
     except MemoryError:
         _fail("out of memory; use a smaller --max-wait, or convert a part with --end", EXIT_ERROR)
     except Exception as err:
@@ -61,6 +69,18 @@ def main() -> None:
         )
 
 
+def _open_streams() -> None:
+    """Open /dev/null for each standard stream that is closed; else a file would be taken for it."""
+    for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):
+        if getattr(sys, name) is None:
+            setattr(sys, name, open(os.devnull, mode, encoding="utf-8"))  # noqa: SIM115
+
+
+def _leave(stream: TextIO) -> None:
+    """Give up a stream that takes no more; what it still holds would be written at exit."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
+
+
 def _usage(err: Exception) -> str:
     """Message of a usage error of typer; "" for other errors."""
     import typer
@@ -73,5 +93,9 @@ def _usage(err: Exception) -> str:
 
 def _fail(message: str, code: int) -> NoReturn:
     line = " ".join(message.split())
-    print(f"mlbatch: error: {line}", file=sys.stderr)
+    try:
+        print(f"mlbatch: error: {line}", file=sys.stderr, flush=True)
+    except OSError:
+        # A full disk as standard error: the exit code is what is left.
+        _leave(sys.stderr)
     sys.exit(code)

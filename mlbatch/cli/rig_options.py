@@ -40,8 +40,11 @@ def located(err: UsageError, places: Mapping[str, str]) -> MlbatchError:
 
 def _may_have_section(rig: Path) -> bool:
     """False if a rig has no such section for certain; most need not be read twice."""
+    from mlbatch.bounded import read_bytes
+    from mlbatch.rig.yaml_tree import MAX_BYTES
+
     try:
-        return _SECTION in rig.read_bytes()
+        return _SECTION in read_bytes(rig, MAX_BYTES)
     except OSError:
         # Reported where the rig is read.
         return False

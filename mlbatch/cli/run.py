@@ -5,7 +5,6 @@ Apart from `convert.py`, whose options are described without loading any of this
 
 from __future__ import annotations
 
-import json
 import shlex
 import sys
 from dataclasses import replace
@@ -14,6 +13,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import typer
 
+from mlbatch.bounded import parse_json, read_text
 from mlbatch.cli.progress import progress_bar
 from mlbatch.cli.summary import exit_beyond, print_summary, say
 from mlbatch.errors import (
@@ -181,7 +181,7 @@ def _beyond_limits_before(target: Target, name: str) -> list[str]:
         return []
     path = target.report or report_paths(target.output, name).report
     try:
-        return exceeded(target.limits, json.loads(path.read_text(encoding="utf-8")))
+        return exceeded(target.limits, parse_json(read_text(path)))
     except (OSError, ValueError) as err:
         raise ExportError(
             f"{path}: expected the report of the complete output for --fail-on, found "

@@ -6,6 +6,7 @@ import json
 from collections.abc import Iterator
 from pathlib import Path
 
+from mlbatch.bounded import parse_json, read_text
 from mlbatch.digest.fields import COLUMN_FIELDS, describe, fields_of
 from mlbatch.digest.run import describe_run, run_files
 from mlbatch.digest.values import Json, values
@@ -89,8 +90,8 @@ def _lines(golden: dict[str, Json]) -> Iterator[str]:
 def read_golden(path: Path) -> dict[str, Json]:
     """Read a golden file; RecordingError for another file."""
     try:
-        golden = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError, RecursionError) as err:
+        golden = parse_json(read_text(path))
+    except (OSError, ValueError) as err:
         found = getattr(err, "strerror", None) or f"{type(err).__name__}: {err}"
         raise RecordingError(
             f"{path}: expected a golden file (JSON), found {found}; write one with "

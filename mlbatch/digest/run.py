@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
+from mlbatch.bounded import parse_json
 from mlbatch.digest.values import Json
 from mlbatch.errors import RecordingError
 from mlbatch.outputs.run_files import RunFiles
@@ -53,7 +53,7 @@ def describe_run(files: RunFiles) -> dict[str, Json]:
     if not files.report:
         return {}
     try:
-        report = json.loads(files.report)
+        report = parse_json(files.report)
         if report["schema"] != _SCHEMA:
             raise ValueError(report["schema"])
         return {
@@ -65,7 +65,7 @@ def describe_run(files: RunFiles) -> dict[str, Json]:
                 f"{one['code']} {one['sensor']}".strip() for one in report["warnings"]
             ),
         }
-    except (KeyError, TypeError, ValueError, RecursionError) as err:
+    except (KeyError, TypeError, ValueError) as err:
         raise RecordingError(
             f"{files.where}: expected a report of the schema {_SCHEMA}, found a damaged one "
             f"({type(err).__name__}: {err}); restore it, or convert again"

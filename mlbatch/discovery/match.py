@@ -23,12 +23,14 @@ from mlbatch.discovery.types import DetectedSensor, PacketKind
 from mlbatch.errors import RecordingError, RigError
 from mlbatch.frames.naming import GENERIC, namespace
 from mlbatch.lidar.interface import NAMED_ONLY, Calibration, Evidence, Lidar, ModelFile
-from mlbatch.rig.rig import RigSensor, StreamSelector
+from mlbatch.rig.rig import MAX_NAME, RigSensor, StreamSelector
 from mlbatch.sensors.advice import with_advice
 from mlbatch.types import StreamTable
 
 # Of the samples of a kind: some hundred packets of 1 kB are less.
 _LARGE_BYTES = 1 << 20
+# Characters of a number after a name, with `_`.
+_NUMBER = 4
 
 
 class Matched(NamedTuple):
@@ -235,11 +237,12 @@ def _name_all(table: StreamTable, found: Sequence[DetectedSensor]) -> None:
         counts[vendor] = counts.get(vendor, 0) + 1
         topic = min((table.streams[stream].topic for stream in sensor.streams), default="")
         place = "_".join(part for part in namespace(topic) if part not in GENERIC)
-        if place and place[0].isalpha() and place.replace("_", "").isalnum():
+        is_name = place[:1].isalpha() and place.replace("_", "").isalnum()
+        if is_name and len(place) <= MAX_NAME - _NUMBER:
             sensor.name = place
         else:
             sensor.name = f"{vendor}_{sensor.lidar.serial or counts[vendor]}"
-        sensor.name += _part(table, sensor)
+        sensor.name = (sensor.name + _part(table, sensor))[: MAX_NAME - _NUMBER]
     _number_equal_names(found)
 
 

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
+from mlbatch.bounded import read_text
 from mlbatch.errors import RigError
 from mlbatch.motion.se3 import rotations_of
 from mlbatch.motion.track import PoseTrack
@@ -29,7 +30,7 @@ _LATEST_NS = 2**31 * NS_PER_S
 def read_tum(path: Path) -> PoseTrack:
     """Read a trajectory; RigError with file and line for the first mistake."""
     try:
-        text = path.read_text(encoding="utf-8-sig")
+        text = read_text(path, encoding="utf-8-sig")
     except (OSError, UnicodeDecodeError) as err:
         reason = getattr(err, "strerror", None) or "bytes that are not UTF-8"
         raise RigError(

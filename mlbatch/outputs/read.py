@@ -8,13 +8,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
-from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING
-from zipfile import BadZipFile
 
 import numpy as np
 
+from mlbatch.bounded import open_file, parse_json
 from mlbatch.errors import RecordingError
 from mlbatch.outputs.clouds import CloudPlace, Values, scan_of_cloud, scan_of_fields
 from mlbatch.outputs.run_files import RunFiles, RunOfOutput, row_of, variants_of
@@ -25,6 +24,7 @@ from mlbatch.verify.commented import CommentedReader
 from mlbatch.verify.float_rows import KITTI_SUFFIX, NUSCENES_SUFFIX, read_rows, start_of
 from mlbatch.verify.folders import ScanFile, entries, refuse_shard, scan_files
 from mlbatch.verify.las import LasReader
+from mlbatch.verify.npz import arrays_of
 from mlbatch.verify.pcd import PcdReader
 from mlbatch.verify.ply import PlyReader
 from mlbatch.verify.verdict import CheckLog, DamageError, VerifyError
@@ -62,7 +62,7 @@ def _scans(path: Path) -> Iterator[Scan]:
     if path.is_dir():
         return _scans_of_folder(path)
     try:
-        with path.open("rb") as file:
+        with open_file(path) as file:
             head = file.read(16)
     except OSError as err:
         raise RecordingError(
@@ -143,8 +143,6 @@ def _scans_of_mcap(output: Path, paths: Mapping[str, Path]) -> Iterator[Scan]:
 
 def _run_of_mcap(output: Path, path: Path, file: McapFile) -> RunOfOutput:
     """The constants of a run in its first file; report and table may be in the folder."""
-    import json
-
     grid = file.metadata.get("mlbatch.grid")
     if grid is None:
         raise RecordingError(
@@ -161,7 +159,7 @@ def _run_of_mcap(output: Path, path: Path, file: McapFile) -> RunOfOutput:
     try:
         return RunOfOutput(
             str(path),
-            tuple(map(str, json.loads(grid["sensors"]))),
+            tuple(map(str, parse_json(grid["sensors"]))),
             grid["rate_hz"],
             int(grid["slices"]),
             grid["timescale"],
@@ -170,7 +168,7 @@ def _run_of_mcap(output: Path, path: Path, file: McapFile) -> RunOfOutput:
             RunFiles.of(output) if "windows_per_file" in grid else own,
             variants_of(grid),
         )
-    except (KeyError, TypeError, ValueError, RecursionError) as err:
+    except (KeyError, TypeError, ValueError) as err:
         raise RecordingError(
             f"{path}: expected rate, slices and sensors in mlbatch.grid, found "
             f"{type(err).__name__}: {err}; convert again"
@@ -313,11 +311,7 @@ def _sensor_index(file: ScanFile, names: tuple[str, ...]) -> int | None:
 
 def _npz_scan(file: ScanFile, run: _FileRun) -> tuple[Scan, int | None]:
     try:
-        with np.load(BytesIO(file.read()), allow_pickle=False) as archive:
-            values = {key: archive[key] for key in archive.files}
-    except (BadZipFile, OSError, ValueError, EOFError) as err:
-        raise DamageError("a complete npz file", str(err)) from err
-    try:
+        values = arrays_of(file)
         if str(values["schema"]) != _SCHEMA:
             raise DamageError(f"the schema {_SCHEMA}", str(values["schema"]))
         names = tuple(map(str, values["sensors"].tolist()))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,6 +10,7 @@ import numpy as np
 
 from mlbatch.arrays import F64Array
 from mlbatch.batching.grid import Grid
+from mlbatch.bounded import MOST_TABLE_BYTES, parse_json, read_text
 from mlbatch.errors import RecordingError, UsageError
 from mlbatch.outputs.table import ScanRow, TableOfRun, read_table
 from mlbatch.types import VARIANTS, RunInfo, SensorInfo
@@ -47,7 +47,7 @@ class RunFiles:
                 "none; put it back where `convert` wrote it"
             )
         try:
-            document = json.loads(self.report)
+            document = parse_json(self.report)
             if document["schema"] != _SCHEMA:
                 raise ValueError(document["schema"])
             grid = document["grid"]
@@ -62,7 +62,7 @@ class RunFiles:
                 self,
                 variants_of(grid),
             )
-        except (KeyError, TypeError, ValueError, RecursionError) as err:
+        except (KeyError, TypeError, ValueError) as err:
             raise self._damaged(err) from err
 
     def sensors(self, names: Sequence[str]) -> tuple[SensorInfo, ...]:
@@ -73,10 +73,10 @@ class RunFiles:
         known: dict[str, tuple[str, F64Array]] = {}
         if self.report:
             try:
-                for sensor in json.loads(self.report)["sensors"]:
+                for sensor in parse_json(self.report)["sensors"]:
                     pose = np.array(sensor["extrinsics"]["body_from_sensor"], np.float64)
                     known[sensor["name"]] = str(sensor["model"]), pose.reshape(4, 4)
-            except (KeyError, TypeError, ValueError, RecursionError) as err:
+            except (KeyError, TypeError, ValueError) as err:
                 raise self._damaged(err) from err
         unknown = ("", np.full((4, 4), np.nan))
         found = ((name, *known.get(name, unknown)) for name in names)
@@ -178,7 +178,7 @@ def row_of(table: TableOfRun | None, index: int, part: int, only: int | None) ->
 
 def _text(path: Path) -> str:
     try:
-        return path.read_text(encoding="utf-8")
+        return read_text(path, MOST_TABLE_BYTES)
     except FileNotFoundError:
         return ""
     except (OSError, UnicodeDecodeError) as err:

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 from pathlib import Path
 
-from mlbatch.errors import ExportError
+from mlbatch.bounded import open_file
+from mlbatch.errors import ExportError, write_error
 from mlbatch.page.document import page_text
 from mlbatch.page.source import Source, find_source, source_of_text
 
@@ -26,7 +28,7 @@ def check_page(path: Path, *, overwrite: bool) -> None:
     if not path.exists():
         return
     try:
-        with path.open("rb") as file:
+        with open_file(path) as file:
             is_page = file.read(len(MARK)) == MARK
     except OSError as err:
         raise ExportError(f"{path}: expected a readable file, found {err.strerror!r}") from err
@@ -55,7 +57,6 @@ def write_text_page(path: Path, text: str) -> None:
         partial.write_bytes(data)
         partial.replace(path)
     except OSError as err:
-        partial.unlink(missing_ok=True)
-        raise ExportError(
-            f"{path}: expected to write the page, found {err.strerror!r}; choose another place"
-        ) from err
+        with contextlib.suppress(OSError):
+            partial.unlink(missing_ok=True)
+        raise write_error(path, err) from err

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from mlbatch.arrays import BoolArray, F32Array, F64Array, U8Array, U16Array
+from mlbatch.bounded import open_file
 from mlbatch.page.windows import Windows
 from mlbatch.units import NS_PER_S
 from mlbatch.verify.containers import BoundedFile, Message, library_errors
@@ -112,7 +113,7 @@ def mcaps_of(path: Path) -> list[Path]:
 
 def _begins_with(path: Path, magic: bytes) -> bool:
     try:
-        with path.open("rb") as file:
+        with open_file(path) as file:
             return file.read(len(magic)) == magic
     except OSError as err:
         raise VerifyError(f"{path}: expected a readable file, found {err.strerror!r}") from err

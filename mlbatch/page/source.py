@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
 
+from mlbatch.bounded import open_file, parse_json
 from mlbatch.errors import ExportError
 from mlbatch.page.values import Values
 from mlbatch.verify.folders import refuse_shard
@@ -27,8 +27,8 @@ class Source:
 def read_report(where: Path, text: str) -> Values:
     """The report in a JSON text."""
     try:
-        root = json.loads(text)
-    except (ValueError, RecursionError) as err:
+        root = parse_json(text)
+    except ValueError as err:
         raise ExportError(
             f"{where}: expected a report in JSON, found {err}; restore it, or convert again"
         ) from err
@@ -65,7 +65,7 @@ def _is_json(path: Path) -> bool:
     if path.is_dir():
         return False
     try:
-        with path.open("rb") as file:
+        with open_file(path) as file:
             return file.read(64).lstrip().startswith(b"{")
     except OSError as err:
         raise ExportError(f"{path}: expected a readable file, found {err.strerror!r}") from err

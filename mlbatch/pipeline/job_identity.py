@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 import mlbatch
+from mlbatch.bounded import open_file, read_bytes
 from mlbatch.errors import RecordingError
 from mlbatch.pipeline.job import Job
 from mlbatch.writers import WriterOptions
@@ -157,7 +158,7 @@ def _content(files: Sequence[Path], session_bytes: int) -> str:
 def _whole_content(file: Path) -> str:
     """Digest of a file that is read as a whole anyway: any byte of it may change points."""
     try:
-        return hashlib.sha256(file.read_bytes()).hexdigest()[:_DIGITS]
+        return hashlib.sha256(read_bytes(file)).hexdigest()[:_DIGITS]
     except OSError as err:
         raise _unreadable(file, err) from err
 
@@ -171,7 +172,7 @@ def _unreadable(file: Path, err: OSError) -> RecordingError:
 def _samples(file: Path, session_bytes: int) -> Iterator[bytes]:
     """Samples of the content of a file."""
     try:
-        with file.open("rb", buffering=0) as opened:
+        with open_file(file) as opened:
             descriptor = opened.fileno()
             size = os.fstat(descriptor).st_size
             for begin, count in _sampled(size, session_bytes):

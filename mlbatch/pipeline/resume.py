@@ -23,7 +23,14 @@ from mlbatch.pipeline.job import Job
 from mlbatch.pipeline.job_identity import difference, input_identity, job_identity
 from mlbatch.pipeline.state_file import FinishedScan, State, StateFile, read_state, state_path
 from mlbatch.types import ImuSamples, Message
-from mlbatch.writers import ScanWriter, WriterOptions, discard, discard_old, partial_path
+from mlbatch.writers import (
+    ScanWriter,
+    WriterOptions,
+    discard,
+    discard_old,
+    export_errors,
+    partial_path,
+)
 from mlbatch.writers.output_file import crc32
 
 if TYPE_CHECKING:
@@ -63,7 +70,9 @@ def find(target: Path) -> EarlierRun:
 
 def forget(target: Path) -> None:
     """Remove the state of an earlier run, and what it would have removed last."""
-    state_path(target).unlink(missing_ok=True)
+    path = state_path(target)
+    with export_errors(path):
+        path.unlink(missing_ok=True)
     discard_old(target)
 
 

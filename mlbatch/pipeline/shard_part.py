@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 
 import mlbatch
+from mlbatch.bounded import parse_json, read_text
 from mlbatch.errors import RecordingError, UsageError
 from mlbatch.pipeline.job_identity import identity_of_parts
 from mlbatch.pipeline.resume import ResumeLog
@@ -353,7 +354,7 @@ def read_account(part: Path) -> Account:
     """The account of a shard; UsageError if there is none, RecordingError if it is damaged."""
     path = part / SHARD_JSON
     try:
-        content = _fields(json.loads(path.read_text(encoding="utf-8")))
+        content = _fields(parse_json(read_text(path)))
     except FileNotFoundError:
         raise UsageError(f"{part}: expected the folder of a shard, found {_found(part)}") from None
     except NotADirectoryError:

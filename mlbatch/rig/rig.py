@@ -17,6 +17,8 @@ if TYPE_CHECKING:
     from mlbatch.ros.point_times import PointRule
 
 DEFAULT_BODY_FRAME = "base_link"
+# Letters of the name of a sensor, which is that of a folder.
+MAX_NAME = 100
 # Fields of `StreamSelector`, and keys of `stream` in the file.
 STREAM_FIELDS = ("source_ip", "port", "topic", "serial", "frame_id", "lidar_id")
 

@@ -39,6 +39,7 @@ from mlbatch.rig.keys import (
 )
 from mlbatch.rig.rig import (
     DEFAULT_BODY_FRAME,
+    MAX_NAME,
     Rig,
     RigSensor,
     StreamSelector,
@@ -59,7 +60,7 @@ MAX_SENSORS = 256
 UNKNOWN = "unknown"
 MAX_OFFSET_S = 2**31
 
-_NAME = re.compile(r"[A-Za-z_]\w*", re.ASCII)
+_NAME = re.compile(rf"[A-Za-z_]\w{{0,{MAX_NAME - 1}}}", re.ASCII)
 _FRAME = re.compile(r"/?[A-Za-z_]\w*(/[A-Za-z_]\w*)*", re.ASCII)
 _TEXT = re.compile(r"\S(.*\S)?")
 # No blanks, no control characters, no surrogates (which no output can store).
@@ -482,9 +483,9 @@ _EXTRINSICS_FORM: Form = {
 # A name fits ROS topics, frames and file names.
 _SENSOR_NAME = Key(
     "name",
-    _word("a name of letters, digits and _ that does not start with a digit", _NAME),
+    _word(f"a name of at most {MAX_NAME} letters, digits and _, not a digit first", _NAME),
     "",
-    text_form(r"[A-Za-z_][A-Za-z0-9_]*"),
+    text_form(rf"[A-Za-z_][A-Za-z0-9_]{{0,{MAX_NAME - 1}}}"),
     "name in topics, folders and frames",
 )
 _MODEL: Key[str | None] = Key("model", _model, None, TEXT, "auto, or a name of `mlbatch sensors`")

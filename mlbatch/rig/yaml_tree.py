@@ -7,6 +7,7 @@ Nothing is constructed from tags, and aliases are refused, so that they cannot m
 from __future__ import annotations
 
 import difflib
+import errno
 import itertools
 import math
 import re
@@ -18,6 +19,7 @@ from typing import NamedTuple
 
 import yaml
 
+from mlbatch.bounded import read_bytes
 from mlbatch.errors import RigError
 
 # Limits for untrusted files; a rig of 256 sensors needs less.
@@ -307,16 +309,15 @@ def _tree(
 
 def _text(file: Path) -> str:
     try:
-        with file.open("rb") as stream:
-            data = stream.read(MAX_BYTES + 1)
-    except (OSError, ValueError) as err:
-        reason = (getattr(err, "strerror", None) or str(err)).lower()
+        data = read_bytes(file, MAX_BYTES)
+    except OSError as err:
+        if err.errno == errno.EFBIG:
+            raise RigError(
+                f"{file}: expected at most {MAX_BYTES} bytes, found more; "
+                "check that this is a rig file and not a recording"
+            ) from err
+        reason = (err.strerror or str(err)).lower()
         raise RigError(f"{file}: expected a readable file, found {reason}; check the path") from err
-    if len(data) > MAX_BYTES:
-        raise RigError(
-            f"{file}: expected at most {MAX_BYTES} bytes, found more; "
-            "check that this is a rig file and not a recording"
-        )
     try:
         return data.decode("utf-8-sig")
     except UnicodeDecodeError as err:

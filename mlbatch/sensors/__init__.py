@@ -8,6 +8,7 @@ distributions add vendors by entry points of the group `mlbatch.sensors`; they a
 
 from __future__ import annotations
 
+import errno
 import importlib
 import pkgutil
 import sys
@@ -18,6 +19,7 @@ from typing import Protocol, cast
 
 from mlbatch import entry_points
 from mlbatch.arrays import U8Array
+from mlbatch.bounded import read_bytes
 from mlbatch.errors import RigError
 from mlbatch.lidar.content_keys import content_keys
 from mlbatch.lidar.interface import Calibration, SensorModel
@@ -134,15 +136,15 @@ def _chosen(vendors: Collection[str] | None) -> list[str]:
 def read_calibration(path: Path) -> Calibration | None:
     """Read a calibration file of any vendor; None if it is none, RigError if it is unreadable."""
     try:
-        if not path.is_file():
-            kind = "a directory" if path.is_dir() else "no such file"
-            raise RigError(f"{path}: expected a calibration file, found {kind}; check the path")
-        with path.open("rb") as file:
-            content = file.read(MAX_CALIBRATION_BYTES + 1)
+        content = read_bytes(path, MAX_CALIBRATION_BYTES)
     except OSError as err:
-        raise RigError(f"{path}: cannot read the calibration file: {err.strerror}") from err
-    if len(content) > MAX_CALIBRATION_BYTES:
-        return None
+        if err.errno == errno.EFBIG:
+            return None
+        is_missing = isinstance(err, FileNotFoundError)
+        found = "no such file" if is_missing else (err.strerror or str(err)).lower()
+        raise RigError(
+            f"{path}: expected a calibration file, found {found}; check the path"
+        ) from err
     return parse_calibration(path, content)
 
 

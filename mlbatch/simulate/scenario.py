@@ -19,6 +19,7 @@ from mlbatch.arrays import F64Array
 from mlbatch.errors import RigError
 from mlbatch.frames.transforms import from_rpy_deg
 from mlbatch.lidar.simulated import LidarModel, LidarSettings
+from mlbatch.rig.rig import MAX_NAME
 from mlbatch.rig.yaml_tree import Node, read_yaml
 from mlbatch.simulate.forest import Forest, grown
 from mlbatch.simulate.models import lidar_models
@@ -36,7 +37,7 @@ from mlbatch.units import NS_PER_S, RAD_PER_DEG
 SCHEMA = "mlbatch.scenario/1"
 SHIPPED = Path(__file__).parent / "scenarios"
 MAX_LIDARS = 16
-_NAME = re.compile(r"[A-Za-z_]\w*", re.ASCII)
+_NAME = re.compile(rf"[A-Za-z_]\w{{0,{MAX_NAME - 1}}}", re.ASCII)
 _TOPIC = re.compile(r"/[A-Za-z_]\w*(/[A-Za-z_]\w*)*", re.ASCII)
 _TEXT = re.compile(r"\S(.*\S)?")
 _ADDRESS = re.compile(r"\d{1,3}(\.\d{1,3}){3}", re.ASCII)
@@ -493,7 +494,7 @@ def _lidar(node: Node, number: int) -> LidarPlan:
         imu=errors is not None,
     )
     return LidarPlan(
-        name=fields["name"].word("a name of letters, digits and _", _NAME),
+        name=fields["name"].word(f"a name of at most {MAX_NAME} letters, digits and _", _NAME),
         settings=settings,
         body_from_sensor=_extrinsics(fields),
         address=_address(fields, f"10.5.5.{87 + number}"),

@@ -9,9 +9,10 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from io import SEEK_END, BufferedReader, BytesIO, FileIO
+from io import SEEK_END, BufferedReader, BytesIO
 from pathlib import Path
 
+from mlbatch.bounded import open_file
 from mlbatch.verify.verdict import DamageError
 
 # Largest unpacked size: this, or this multiple of the stored bytes. Scans shrink to a half or a
@@ -59,7 +60,7 @@ class BoundedFile(BufferedReader):
     """A file that refuses to read past its end, before anything is allocated."""
 
     def __init__(self, path: Path) -> None:
-        super().__init__(FileIO(path))
+        super().__init__(open_file(path))
         self.size = self.seek(0, SEEK_END)
         self.seek(0)
 

@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from mlbatch.arrays import BoolArray, F32Array, F64Array, I64Array
+from mlbatch.bounded import MOST_TABLE_BYTES, read_bytes, read_text
 from mlbatch.verify.folders import ScanFile, readable, scan_files
 from mlbatch.verify.report_checks import RunMetadata
 from mlbatch.verify.scan import StoredScan
@@ -64,7 +65,7 @@ def read_rows(file: ScanFile) -> FloatRows:
     rows = _rows(file.read(), 5)
     path = file.path.with_name(file.path.name.removesuffix(NUSCENES_SUFFIX) + TIME_SUFFIX)
     try:
-        times = _rows(path.read_bytes(), 2)
+        times = _rows(read_bytes(path, MOST_TABLE_BYTES), 2)
     except OSError as err:
         raise DamageError(f"a readable file {path.name} next to it", str(err.strerror)) from err
     if len(times) != len(rows):
@@ -83,7 +84,7 @@ def read_times(folder: Path, files: list[ScanFile]) -> list[int]:
     """Starts of the scans of a folder, ns, in the order of their names."""
     path = folder / TIMES_TXT
     try:
-        lines = path.read_text(encoding="utf-8").splitlines()
+        lines = read_text(path).splitlines()
     except (OSError, UnicodeDecodeError) as err:
         raise DamageError(f"a readable {TIMES_TXT} next to the scans", str(err)) from err
     if len(lines) != len(files):

@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
+from mlbatch.bounded import MOST_TABLE_BYTES, read_bytes
 from mlbatch.verify.scan import StoredScan
 from mlbatch.verify.verdict import CheckLog, DamageError, VerifyError
 
@@ -35,7 +36,7 @@ class ScanFile:
     def read(self) -> bytes:
         """The bytes of the file."""
         try:
-            return self.path.read_bytes()
+            return read_bytes(self.path, MOST_TABLE_BYTES)
         except OSError as err:
             raise DamageError("a readable file", str(err.strerror)) from err
 

@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from functools import lru_cache
 from io import BytesIO
-from typing import cast
+from typing import Any, cast
 from zipfile import ZIP_DEFLATED, ZIP_STORED, ZipFile
 
 import numpy as np
@@ -199,6 +199,12 @@ class NpzReader:
             column_lidar_id=cast(U8Array, values["column_lidar_id"]),
             fill=cast(F32Array, values["fill"]),
         )
+
+
+def arrays_of(file: ScanFile) -> dict[str, npt.NDArray[Any]]:
+    """All arrays of a file by key, of its own memory."""
+    members = _members(file)
+    return {key: _array(key, members.pop(key)).copy() for key in list(members)}
 
 
 def _members(file: ScanFile) -> dict[str, bytes]:

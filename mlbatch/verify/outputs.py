@@ -11,6 +11,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from mlbatch.bounded import open_file
 from mlbatch.verify import messages, npz
 from mlbatch.verify.examination import Examination, Progress
 from mlbatch.verify.file_formats import FileFormat, format_of
@@ -77,7 +78,7 @@ def check_output(output: Output) -> Verdict:
         check = _check_of_folder(path)
         return check(output)
     try:
-        with path.open("rb") as file:
+        with open_file(path) as file:
             head = file.read(16)
     except OSError as err:
         raise VerifyError(f"{path}: expected a readable file, found {err.strerror!r}") from err

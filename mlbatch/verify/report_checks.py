@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
 from fractions import Fraction
@@ -12,6 +11,7 @@ from typing import TypeAlias, cast
 import numpy as np
 
 from mlbatch.arrays import BoolArray, F64Array, I64Array
+from mlbatch.bounded import MOST_TABLE_BYTES, parse_json, read_text
 from mlbatch.errors import UsageError
 from mlbatch.units import parse_rate
 from mlbatch.verify.scan_checks import Grid
@@ -154,8 +154,8 @@ def metadata_of_grid(log: CheckLog, where: str, grid: dict[str, str]) -> RunMeta
         if key not in grid:
             log.fail("metadata", f"{where} {key}", "a text", "nothing")
     try:
-        names = json.loads(grid.get("sensors", ""))
-    except (ValueError, RecursionError):
+        names = parse_json(grid.get("sensors", ""))
+    except ValueError:
         names = None
     if not isinstance(names, list):
         log.fail("metadata", f"{where} sensors", "a list", grid.get("sensors"))
@@ -188,8 +188,8 @@ class Document:
     def parsed(cls, log: CheckLog, path: Path, text: str, where: str = "") -> Document:
         """A document from its text; where: its name if it is in the file at `path`."""
         try:
-            return cls(log, where or path.name, cast(Json, json.loads(text)))
-        except (ValueError, RecursionError) as err:
+            return cls(log, where or path.name, cast(Json, parse_json(text)))
+        except ValueError as err:
             raise VerifyError(
                 f"{path}: expected a report in JSON, found {err}; restore it, or convert again"
             ) from err
@@ -311,7 +311,7 @@ class ReportPlaces:
 def _text(path: Path) -> str | None:
     """A small file; None if there is none."""
     try:
-        return path.read_text(encoding="utf-8")
+        return read_text(path, MOST_TABLE_BYTES)
     except FileNotFoundError:
         return None
     except OSError as err:

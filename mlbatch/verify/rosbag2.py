@@ -12,6 +12,7 @@ from typing import NamedTuple, TypeAlias
 
 import yaml
 
+from mlbatch.bounded import read_text
 from mlbatch.verify.verdict import CheckLog, VerifyError
 
 METADATA = "metadata.yaml"
@@ -42,9 +43,7 @@ def open_bag(log: CheckLog, folder: Path) -> tuple[list[Path], Yaml]:
     """The MCAP files of a bag by their numbers, one at least, and the content of metadata.yaml."""
     path = folder / METADATA
     try:
-        if path.stat().st_size > _LARGEST_BYTES:
-            raise VerifyError(f"{path}: expected a few lines, found more than 1 MiB; restore it")
-        root: Yaml = yaml.load(path.read_text(encoding="utf-8"), PlainLoader)
+        root: Yaml = yaml.load(read_text(path, _LARGEST_BYTES), PlainLoader)
     except (OSError, ValueError, RecursionError, yaml.YAMLError) as err:
         text = " ".join(str(err).split())
         raise VerifyError(f"{path}: expected YAML, found {text}; restore it") from err

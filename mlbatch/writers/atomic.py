@@ -9,7 +9,6 @@ its name after that, unless `--no-fsync` is given.
 from __future__ import annotations
 
 import contextlib
-import errno
 import os
 import re
 import shutil
@@ -17,7 +16,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
-from mlbatch.errors import ExportError
+from mlbatch.errors import ExportError, write_error
 from mlbatch.writers.durable import sync_entries, sync_to_disk
 from mlbatch.writers.formats import format_of_files
 
@@ -36,15 +35,6 @@ _SHARED_FILE = r".+_\d+\.mcap|metadata\.yaml|times\.txt"
 # A report may have any name (`--report`); it is recognised by its first bytes, in any version.
 _REPORT = rb'\{\s*"schema":\s*"mlbatch\.report/'
 _HEAD_BYTES = 64
-_ADVICE = {
-    errno.ENOSPC: "free space on this disk or choose another output",
-    errno.EDQUOT: "free space in your quota or choose another output",
-    errno.EFBIG: "raise the limit of file sizes or choose another disk",
-    errno.EACCES: "choose an output where you may write",
-    errno.EPERM: "choose an output where you may write",
-    errno.EROFS: "choose an output on a disk that is not read-only",
-    errno.ENAMETOOLONG: "choose a shorter name",
-}
 _BYTES_PER_MB = 1_000_000
 
 
@@ -54,9 +44,7 @@ def export_errors(path: Path) -> Iterator[None]:
     try:
         yield
     except OSError as err:
-        advice = _ADVICE.get(err.errno or 0, "check the disk and the name of the output")
-        reason = err.strerror or str(err)
-        raise ExportError(f"{path}: expected to write it, found {reason!r}; {advice}") from err
+        raise write_error(path, err) from err
 
 
 class Output(NamedTuple):

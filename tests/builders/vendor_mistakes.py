@@ -412,7 +412,7 @@ VENDOR_MISTAKES: dict[str, tuple[str, int, str]] = {
     "metadata is a folder": (
         "vlp16/drive.pcap --metadata files",
         1,
-        "files: expected a calibration file, found a directory; check the path",
+        "files: expected a calibration file, found a folder; check the path",
     ),
     "metadata of clouds": (
         "clouds.db3 --rig cloud_csv.yaml",

@@ -26,7 +26,7 @@ FLOORS: tuple[tuple[str, ...], ...] = (
     ("native",),
     ("arrays", "units", "entry_points"),
     # "": the package itself, with its version; it loads the rest on demand.
-    ("errors", ""),
+    ("errors", "bounded", ""),
 )
 FLOOR = {name: number for number, names in enumerate(FLOORS) for name in names}
 # A module in the folder of a vendor.
@@ -93,6 +93,7 @@ def test_no_module_is_private() -> None:
     assert sorted(found) == []
 
 
-def test_the_root_has_seven_modules() -> None:
+def test_the_root_has_eight_modules() -> None:
     found = {path.stem for path in PACKAGE.glob("*.py")}
-    assert found == {"__init__", "__main__", "api", "types", "arrays", "units", "errors"}
+    base = {"types", "arrays", "units", "errors", "bounded"}
+    assert found == {"__init__", "__main__", "api"} | base

@@ -67,7 +67,7 @@ X_KEYS = (
 )
 NUMBER = "expected a finite number"
 PLAIN_NUMBER = "write a decimal number, without quotes or unit"
-NAME = "a name of letters, digits and _ that does not start with a digit"
+NAME = "a name of at most 100 letters, digits and _, not a digit first"
 FIX = "correct it or remove the key"
 
 MISTAKES: list[tuple[str, str]] = [
@@ -127,6 +127,8 @@ MISTAKES: list[tuple[str, str]] = [
                           "write `key: value`"),
     ("sensors: [{name: front left}]\n", f"1: {S}.name: expected {NAME}, found 'front left'; {FIX}"),
     ("sensors: [{name: 1st}]\n", f"1: {S}.name: expected {NAME}, found '1st'; {FIX}"),
+    (f"sensors: [{{name: {'a' * 101}}}]\n",
+     f"1: {S}.name: expected {NAME}, found '{'a' * 40}...'; {FIX}"),
     ("sensors: [{name: [a]}]\n", f"1: {S}.name: expected {NAME}, found a list of 1; {FIX}"),
     ("sensors: [{name: null}]\n", f"1: {S}.name: expected {NAME}, found nothing; {FIX}"),
     (one("optional: maybe"), f"3: {S}.optional: expected true or false, found 'maybe'; "

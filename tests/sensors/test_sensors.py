@@ -57,7 +57,7 @@ def test_files_that_cannot_be_read_are_reported(tmp_path: Path) -> None:
         RigError, match=r"none\.json: expected a calibration file, found no such file"
     ):
         sensors.read_calibration(tmp_path / "none.json")
-    with pytest.raises(RigError, match="expected a calibration file, found a directory"):
+    with pytest.raises(RigError, match="expected a calibration file, found a folder"):
         sensors.read_calibration(tmp_path)
 
 

@@ -6,6 +6,7 @@ docs/sources/messages.md section 8.
 
 from __future__ import annotations
 
+import errno
 import io
 import re
 import struct
@@ -15,6 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
+from mlbatch.bounded import read_bytes
 from mlbatch.rig.rig import Sweeps
 from mlbatch.units import NS_PER_S
 
@@ -45,14 +47,13 @@ class _Points:
 def read_sweep(path: Path, sweeps: Sweeps, stamp_ns: int) -> bytes:
     """Return a PointCloud2 in ROS 1 serialisation with the points of a file."""
     try:
-        size = path.stat().st_size
-        if size > MOST_BYTES:
-            raise SweepError(
-                f"{path}: expected at most {MOST_BYTES} bytes, found {size}; check that it is one "
-                "sweep"
-            )
-        data = path.read_bytes()
+        data = read_bytes(path, MOST_BYTES)
     except OSError as err:
+        if err.errno == errno.EFBIG:
+            raise SweepError(
+                f"{path}: expected at most {MOST_BYTES} bytes, found {path.stat().st_size}; check "
+                "that it is one sweep"
+            ) from err
         raise SweepError(
             f"{path}: expected a readable file, found {(err.strerror or str(err)).lower()}; check "
             "the path"
