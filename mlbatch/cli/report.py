@@ -34,6 +34,7 @@ def report(
     ),
 ) -> None:
     """Write a page (HTML) of a run: verdict, timeline, fill, clocks, accounts, scans."""
+    from mlbatch.bounded import MOST_BYTES
     from mlbatch.cli.options import is_stdout
     from mlbatch.errors import UsageError, one_line
     from mlbatch.page import check_page, find_source, source_of_text, write_page
@@ -45,7 +46,13 @@ def report(
                 "-o: expected a name for the page of standard input, found none; give -o run.html, "
                 "or -o - to print it"
             )
-        found = source_of_text(Path("standard input"), sys.stdin.read())
+        text = sys.stdin.buffer.read(MOST_BYTES + 1)
+        if len(text) > MOST_BYTES:
+            raise UsageError(
+                f"standard input: expected a report, found more than {MOST_BYTES} bytes; give the "
+                "report of `mlbatch convert`"
+            )
+        found = source_of_text(Path("standard input"), text)
     else:
         found = find_source(source, report)
     page = output or found.page

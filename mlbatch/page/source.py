@@ -24,7 +24,7 @@ class Source:
     page: Path  # usual place of the page
 
 
-def read_report(where: Path, text: str) -> Values:
+def read_report(where: Path, text: str | bytes) -> Values:
     """The report in a JSON text."""
     try:
         root = parse_json(text)
@@ -42,7 +42,7 @@ def read_report(where: Path, text: str) -> Values:
     return report
 
 
-def source_of_text(where: Path, text: str) -> Source:
+def source_of_text(where: Path, text: str | bytes) -> Source:
     """The run of a report alone, given as text; where: for errors."""
     return Source(read_report(where, text), None, None, where.with_suffix(".html"))
 

@@ -103,7 +103,7 @@ def test_a_rig_and_json_cannot_both_be_printed(shell: Shell) -> None:
 
 
 def _stdin(monkeypatch: pytest.MonkeyPatch, text: str) -> None:
-    monkeypatch.setattr("sys.stdin", io.StringIO(text))
+    monkeypatch.setattr("sys.stdin", io.TextIOWrapper(io.BytesIO(text.encode())))
 
 
 def test_a_page_of_a_report_from_standard_input(
