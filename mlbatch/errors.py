@@ -69,6 +69,11 @@ class Interrupted(MlbatchError):
     """An interrupted run that `--resume` can continue (exit code 130)."""
 
 
+def install_extra(extra: str) -> str:
+    """Return the command that installs an extra; also right after an installation from a clone."""
+    return f"pip install 'mlbatch[{extra}]'"
+
+
 def write_error(path: object, err: OSError) -> ExportError:
     """The error for a fault of the system while a path is written."""
     remedy = _REMEDIES.get(err.errno or 0, "check the disk and the name of the output")

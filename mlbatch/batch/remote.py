@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import fnmatch
+import importlib
 import os
 import re
 import time
@@ -18,7 +19,7 @@ from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
 from mlbatch.batch.identity import CALIBRATION_SUFFIXES, LARGEST_CALIBRATION
-from mlbatch.errors import MlbatchError, RecordingError, UsageError
+from mlbatch.errors import MlbatchError, RecordingError, UsageError, install_extra
 
 T = TypeVar("T")
 
@@ -56,21 +57,29 @@ class _Place(NamedTuple):
 
 
 def _place(url: str) -> _Place:
+    """The store of a URL; UsageError without obstore, which is imported after this."""
     scheme, _, rest = url.partition("://")
     bucket, _, path = rest.partition("/")
     root = f"{scheme}://{bucket}"
     return _Place(_store(root), root, path)
 
 
-@lru_cache(maxsize=64)
-def _store(root: str) -> Any:
+def check_package(url: str) -> None:
+    """Raise UsageError without obstore."""
     try:
-        from obstore.store import from_url
+        importlib.import_module("obstore.store")
     except ImportError as err:
         raise UsageError(
-            f"{root}: expected the package obstore for URLs, found none ({err}); "
-            'pip install "mlbatch[remote]"'
+            f"{url}: expected the package obstore for URLs, found none ({err}); "
+            f"{install_extra('remote')}"
         ) from err
+
+
+@lru_cache(maxsize=64)
+def _store(root: str) -> Any:
+    check_package(root)
+    from obstore.store import from_url
+
     allows_http = root.startswith("http://") or os.environ.get("AWS_ALLOW_HTTP") == "true"
     retry = {"max_retries": 2, "retry_timeout": timedelta(seconds=10)}
     options = {"timeout": _TIMEOUT, "connect_timeout": "10s", "allow_http": allows_http}
@@ -119,9 +128,9 @@ def _first_line(err: Exception) -> str:
 
 def head(url: str) -> RemoteFile:
     """Size and version of a file; RecordingError without one."""
+    place = _place(url)
     import obstore
 
-    place = _place(url)
     found = _repeated(url, lambda: obstore.head(place.store, place.path))
     return _remote_file(place.root, found, url)
 
@@ -133,11 +142,10 @@ def _remote_file(root: str, meta: Any, url: str = "") -> RemoteFile:
 
 def listed(url: str) -> list[RemoteFile]:
     """All files below a folder, by name; none of a web server, which has no lists."""
-    import obstore
-
     if url.partition("://")[0] in _WEB:
         return []
     place = _place(url if url.endswith("/") else f"{url}/")
+    import obstore
 
     def pages() -> list[RemoteFile]:
         batches = obstore.list(place.store, prefix=place.path.rstrip("/") or None)
@@ -216,9 +224,9 @@ def download(file: RemoteFile, target: Path) -> None:
 
     A copy that was interrupted continues, if the file has the same version.
     """
+    place = _place(file.url)
     import obstore
 
-    place = _place(file.url)
     partial = target.with_name(f"{target.name}.{_plain(file.version)}.partial")
     with partial.open("ab") as copy:
         at = copy.tell()
@@ -252,17 +260,17 @@ def _plain(version: str) -> str:
 
 def upload(path: Path, url: str) -> None:
     """Copy a file to a store, in parts; it appears complete or not at all."""
+    place = _place(url)
     import obstore
 
-    place = _place(url)
     _repeated(url, lambda: obstore.put(place.store, place.path, path))
 
 
 def read_text(url: str) -> str:
     """The text of a small file; "" without one."""
+    place = _place(url)
     import obstore
 
-    place = _place(url)
     with contextlib.suppress(RecordingError):
         return bytes(_repeated(url, lambda: obstore.get(place.store, place.path).bytes())).decode(
             "utf-8", "replace"
@@ -272,8 +280,8 @@ def read_text(url: str) -> str:
 
 def remove(url: str) -> None:
     """Remove a file, if it exists."""
+    place = _place(url)
     import obstore
 
-    place = _place(url)
     with contextlib.suppress(RecordingError):
         _repeated(url, lambda: obstore.delete(place.store, place.path))

@@ -14,8 +14,15 @@ from mlbatch.errors import ExportError
 def tasks_of(
     sessions: Sequence[Session], output: str, cache: Cache, *, retries: int, pages: bool
 ) -> list[Task]:
-    """The tasks of sessions; ExportError where the output cannot be one."""
+    """The tasks of sessions; ExportError where the output cannot be one, UsageError for URLs."""
     uploads = is_url(output)
+    # Without the package every session would fail.
+    inputs = (text for session in sessions for text in (*session.inputs, session.rig or ""))
+    url = next(filter(is_url, (output, *inputs)), None)
+    if url is not None:
+        from mlbatch.batch.remote import check_package
+
+        check_package(url)
     # Workers have other working folders.
     folder = cache.output(output) if uploads else Path(output).absolute()
     if folder.exists() and not folder.is_dir():

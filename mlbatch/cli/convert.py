@@ -323,7 +323,7 @@ def convert(
 ) -> None:
     """Turn raw lidar packets into merged scans at an exact rate."""
     # As a path, s3://bucket/name is s3:/bucket/name.
-    paths = [str(path).partition(":/") for path in (*recordings, output, rig)]
+    paths = [str(path).partition(":/") for path in (*recordings, *(metadata or ()), output, rig)]
     if any(colon and scheme.isalnum() for scheme, colon, _ in paths):
         from mlbatch.cli.convert_remote import convert_remote
 

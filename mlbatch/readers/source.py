@@ -340,6 +340,13 @@ def _opened(path: Path) -> FileIO:
 
 def _unreadable(path: Path, err: OSError) -> str:
     expected = f"{path}: expected a recording"
+    # As a path, s3://bucket/name is s3:/bucket/name.
+    scheme, is_url, rest = str(path).partition(":/")
+    if is_url and scheme.isalnum() and isinstance(err, FileNotFoundError):
+        return (
+            f"{scheme}://{rest.lstrip('/')}: expected a recording on this machine, found a URL; "
+            "copy it here, or give it to mlbatch convert or batch, which read URLs"
+        )
     if isinstance(err, FileNotFoundError):
         return f"{expected}, found no such file; check the path"
     if isinstance(err, PermissionError):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -122,6 +123,48 @@ def test_mistake(shell: Shell, place: Path, name: str) -> None:
 @pytest.mark.parametrize("name", REAL_MISTAKES)
 def test_mistake_with_a_real_recording(shell: Shell, place: Path, name: str) -> None:
     check(shell, place, REAL_MISTAKES[name])
+
+
+NO_OBSTORE = (
+    "expected the package obstore for URLs, found none ({*}); pip install 'mlbatch{*}[remote]'"
+)
+HERE = (
+    "expected a recording on this machine, found a URL; copy it here, or give it to mlbatch "
+    "convert or batch, which read URLs"
+)
+# (command without the extra, exit code, message)
+URLS = {
+    "input": ("convert https://e.org/a.pcap -o x.mcap", 2, f"https://e.org: {NO_OBSTORE}"),
+    "output": ("convert fix/two_lidars.pcap -o s3://b/x.mcap", 2, f"s3://b: {NO_OBSTORE}"),
+    "metadata": (
+        "convert bare/one.pcap -m https://e.org/m.json -o x.mcap",
+        2,
+        f"https://e.org: {NO_OBSTORE}",
+    ),
+    "batch": ("batch https://e.org/a.pcap -o out", 2, f"https://e.org/a.pcap: {NO_OBSTORE}"),
+    "pattern": ("batch s3://b/*.pcap -o out", 2, f"s3://b: {NO_OBSTORE}"),
+    "folder": ("batch fix/two_lidars.pcap -o s3://b/out", 2, f"s3://b/out: {NO_OBSTORE}"),
+    "state": ("batch-status s3://b/out", 2, f"s3://b: {NO_OBSTORE}"),
+    "inspected": ("inspect s3://b/x.pcap", 1, f"s3://b/x.pcap: {HERE}"),
+    "compared": ("compare https://e.org/x.mcap", 1, f"https://e.org/x.mcap: {HERE}"),
+}
+
+
+@pytest.mark.parametrize("name", URLS)
+def test_a_url_without_the_extra(
+    shell: Shell, name: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    from mlbatch.batch.remote import _store
+
+    _store.cache_clear()
+    monkeypatch.setitem(sys.modules, "obstore", None)
+    monkeypatch.setitem(sys.modules, "obstore.store", None)
+    monkeypatch.setenv("MLBATCH_CACHE", str(tmp_path))
+    command, code, message = URLS[name]
+    outcome = shell(command)
+    pattern = ".*".join(map(re.escape, message.split("{*}")))
+    assert re.fullmatch(f"mlbatch: error: {pattern}\n", outcome.err), outcome.err
+    assert (outcome.code, outcome.out) == (code, "")
 
 
 def test_ambiguous_metadata_name_their_files(shell: Shell, place: Path) -> None:
