@@ -99,8 +99,7 @@ def run(job: Job, target: Target) -> None:
 
 def _run_one(job: Job, target: Target) -> list[str]:
     """Make one output; returns what exceeds limits of `--fail-on`, a line each."""
-    # A dry run without an output decodes what a .mcap of this point layout would contain.
-    name = choose_format(target.output or Path("scans.mcap"), target.format)
+    name = choose_format(target.output, target.format)
     options = WriterOptions(
         target.point_layout,
         target.overwrite,

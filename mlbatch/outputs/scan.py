@@ -94,7 +94,7 @@ class Scan:
     # (s,) by sensor, columns present / columns expected, 0 to 1; NaN: unknown.
     fill: F32Array = field(default_factory=lambda: np.zeros(0, np.float32))
     absent: frozenset[str] = frozenset()
-    sensor: str = ""  # the only one, of an output with `--split`
+    sensor: str = ""  # the only one: of a part, or with `--split`
 
     @classmethod
     def copied(cls, scan: types.Scan) -> Scan:
@@ -164,8 +164,9 @@ class Scan:
     def __repr__(self) -> str:
         """One line; the arrays are not printed."""
         state = "complete" if self.complete else "incomplete"
+        names = self.sensor or ", ".join(self.sensors)
         return (
-            f"<Scan {self.index}: {self.point_count} points of {', '.join(self.sensors)}, "
+            f"<Scan {self.index}: {self.point_count} points of {names}, "
             f"{self.start_ns} to {self.end_ns} ns {self.info.timescale}, {state}>"
         )
 
@@ -188,6 +189,7 @@ class Scan:
         mine = self.lidar_id[:, 0] == number if is_organized else self.lidar_id == number
         found = replace(
             self,
+            sensor=sensor,
             column_stamp_ns=self.column_stamp_ns[columns],
             column_lidar_id=self.column_lidar_id[columns],
             columns_per_sensor=_only(self.columns_per_sensor, number, 0),

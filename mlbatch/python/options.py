@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import difflib
+import inspect
 import math
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import replace
 from fractions import Fraction
 from os import PathLike, fspath
 from pathlib import Path
-from typing import TypeAlias
+from typing import Any, Literal, TypeAlias, TypedDict, TypeVar
 
 from mlbatch.discovery.discover import SensorSelection
 from mlbatch.errors import UsageError
@@ -35,6 +37,8 @@ Rate: TypeAlias = int | float | str | Fraction
 # Nanoseconds of the common clock; or a text as on the command line: ISO time, epoch seconds, +S.
 Moment: TypeAlias = int | str
 Box: TypeAlias = "tuple[float, float, float, float, float, float]"
+
+F = TypeVar("F", bound=Callable[..., Any])
 
 _BOX_VALUES = 6
 
@@ -79,23 +83,113 @@ def choice(option: str, value: str, known: Iterable[str]) -> str:
     return value
 
 
-def session_job(
-    recordings: Paths | tuple[Paths, ...],
-    *,
-    rig: AnyPath | None = None,
-    metadata: Paths = (),
-    only: Names = (),
-    ignore: Names = (),
-    identity_extrinsics: bool = False,
-    clock: str = "sensor",
-    align_clocks: bool = False,
-    decode: Mapping[str, str] | None = None,
-    strict: bool = False,
-    engine: str = "auto",
-) -> Job:
+class SessionOptions(TypedDict, total=False):
+    """Options that select recordings and sensors, with the names of `mlbatch convert`."""
+
+    rig: AnyPath | None
+    metadata: Paths
+    only: Names
+    ignore: Names
+    identity_extrinsics: bool
+    clock: str
+    align_clocks: bool
+    align_to: str
+    decode: Mapping[str, str] | None
+    strict: bool
+    engine: str
+
+
+class WindowOptions(TypedDict, total=False):
+    """Options of windows and points but the rate; max_wait: s, ranges and boxes: m."""
+
+    start: Moment | None
+    end: Moment | None
+    slices: int
+    layout: str
+    sort: str
+    split: bool
+    keep_partial: bool
+    drop_incomplete: float  # percent
+    max_wait: float
+    min_range: float
+    max_range: float
+    exclude_boxes: Iterable[Box]
+    keep_repeated: bool
+    batching: str
+    batching_times: str
+    deskew: AnyPath | None  # "imu", "constant-velocity", or the path of a trajectory
+    deskew_to: str | None
+
+
+class RatedOptions(WindowOptions, total=False):
+    """Options of windows and points."""
+
+    rate: Rate | None  # Hz
+
+
+class ScanOptions(SessionOptions, RatedOptions, total=False):
+    """Options of scans."""
+
+
+class OutputOptions(TypedDict, total=False):
+    """Options of an output."""
+
+    copy_topics: Names
+    stamp: str
+    format: str | None
+    point_layout: str
+    compression: str
+    ply_style: str
+    max_bag_duration: float  # s of recording in a file of a bag; 0: all in one file
+    overwrite: bool
+    fsync: bool  # wait until the output is on the disk
+    report: AnyPath | None
+    jobs: int | Literal["auto"]
+
+
+class ConvertOptions(ScanOptions, OutputOptions, total=False):
+    """Options of a conversion."""
+
+
+def check_names(call: str, options: Mapping[str, object], *tables: type) -> None:
+    """Raise UsageError for an option that a function does not have."""
+    known = sorted(_names_of(tables))
+    for name in options:
+        if name not in known:
+            close = difflib.get_close_matches(name, known, 1)
+            remedy = f"write {close[0]}, or see" if close else "see"
+            raise UsageError(
+                f"{call}: expected an option of `mlbatch convert` that it has, found {name!r}; "
+                f"{remedy} docs/python.md"
+            )
+
+
+def documented(*tables: type) -> Callable[[F], F]:
+    """Give the keywords of tables to `help` and to completion."""
+
+    def with_signature(function: F) -> F:
+        signature = inspect.signature(function)
+        kept = [one for one in signature.parameters.values() if one.kind != one.VAR_KEYWORD]
+        kept += [
+            inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=...)
+            for name in _names_of(tables)
+        ]
+        function.__signature__ = signature.replace(parameters=kept)  # type: ignore[attr-defined]
+        return function
+
+    return with_signature
+
+
+def _names_of(tables: Iterable[type]) -> list[str]:
+    return [name for table in tables for name in table.__annotations__]
+
+
+def session_job(recordings: Paths | tuple[Paths, ...], options: SessionOptions) -> Job:
     """The options that select recordings and sensors; those of windows have their defaults."""
-    choice("clock", clock, ("sensor", "host"))
-    choice("engine", engine, (*ENGINES, *ALIASES))
+    clock = choice("clock", options.get("clock", "sensor"), ("sensor", "host"))
+    engine = choice("engine", options.get("engine", "auto"), (*ENGINES, *ALIASES))
+    align_to = choice("align_to", options.get("align_to", "host"), ("host", "first"))
+    aligned = options.get("align_clocks", False)
     several = recordings if isinstance(recordings, tuple) else (recordings,)
     found = expand(path for one in several for path in paths_of("recording", one))
     if not found:
@@ -103,88 +197,61 @@ def session_job(
     return Job(
         recordings=found,
         selection=SensorSelection(
-            rig=path_of("rig", rig),
-            metadata=paths_of("metadata", metadata),
-            only=names_of(only),
-            ignore=names_of(ignore),
-            identity_extrinsics=identity_extrinsics,
+            rig=path_of("rig", options.get("rig")),
+            metadata=paths_of("metadata", options.get("metadata", ())),
+            only=names_of(options.get("only", ())),
+            ignore=names_of(options.get("ignore", ())),
+            identity_extrinsics=options.get("identity_extrinsics", False),
             host_clock=clock == "host",
-            aligned=align_clocks,
-            decode=dict(decode or {}),
+            aligned=aligned,
+            decode=dict(options.get("decode") or {}),
         ),
-        align_clocks_to="host" if align_clocks else "",
-        strict=strict,
+        align_clocks_to=align_to if aligned else "",
+        strict=options.get("strict", False),
         engine=ALIASES.get(engine, engine),
     )
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class ScanOptions:
-    """Options of windows and points, with the names and defaults of `mlbatch convert`.
-
-    rate: Hz; start, end: see `Moment`; max_wait: s; ranges and boxes: m; drop_incomplete: percent.
-    """
-
-    rate: Rate | None = None
-    start: Moment | None = None
-    end: Moment | None = None
-    slices: int = 1
-    layout: str = "dense"
-    sort: str = "columns"
-    split: bool = False
-    keep_partial: bool = False
-    drop_incomplete: float = 0.0
-    max_wait: float = 1.0
-    min_range: float = 0.0
-    max_range: float = math.inf
-    exclude_boxes: Iterable[Box] = ()
-    keep_repeated: bool = False
-    copy_topics: Names = ()
-    stamp: str = "start"
-    batching: str = "window"
-    batching_times: str = "common"
-    # "imu", "constant-velocity", or the path of a trajectory.
-    deskew: AnyPath | None = None
-    deskew_to: str | None = None
-
-    def apply(self, job: Job) -> Job:
-        """A job with these options."""
-        choice("layout", self.layout, ("dense", "organized"))
-        choice("stamp", self.stamp, INSTANTS)
-        choice("deskew_to", self.deskew_to or INSTANTS[0], INSTANTS)
-        check_ranges_m("min_range", self.min_range, "max_range", self.max_range)
-        if not 0 <= self.drop_incomplete <= 100:
-            raise UsageError(
-                f"drop_incomplete: expected a share from 0 to 100 %, found "
-                f"{self.drop_incomplete:g}; correct it"
-            )
-        start, end, are_dates = limits_of("start", self.start, "end", self.end)
-        job = replace(
-            job,
-            # By the text of a float: 29.97 means 2997/100, not the nearest binary number.
-            rate=None if self.rate is None else parse_rate(str(self.rate)),
-            slices=check_slices("slices", self.slices),
-            layout=self.layout,
-            sort=check_sort("sort", self.sort, self.layout),
-            split=self.split,
-            keep_partial=self.keep_partial,
-            keep_repeated=self.keep_repeated,
-            drop_incomplete=self.drop_incomplete,
-            max_wait_ns=wait_ns("max_wait", self.max_wait, self.max_wait),
-            start=start,
-            end=end,
-            limits_are_dates=are_dates,
-            min_range_m=self.min_range,
-            max_range_m=self.max_range,
-            boxes_m=tuple(_box(box) for box in self.exclude_boxes),
-            passed=names_of(self.copy_topics),
-            stamp=self.stamp,
-            batching=self.batching,
-            batching_times=self.batching_times,
-            deskew=str(path_of("deskew", self.deskew) or ""),
-            deskew_to=self.deskew_to or INSTANTS[0],
+def window_job(job: Job, options: RatedOptions) -> Job:
+    """A job with the options of windows and points."""
+    layout = choice("layout", options.get("layout", "dense"), ("dense", "organized"))
+    rate = options.get("rate")
+    deskew_to = options.get("deskew_to")
+    low = options.get("min_range", 0.0)
+    high = options.get("max_range", math.inf)
+    check_ranges_m("min_range", low, "max_range", high)
+    drop_incomplete = options.get("drop_incomplete", 0.0)
+    if not 0 <= drop_incomplete <= 100:
+        raise UsageError(
+            f"drop_incomplete: expected a share from 0 to 100 %, found {drop_incomplete:g}; "
+            "correct it"
         )
-        return check_deskew(check_batching(job), self.deskew_to is not None)
+    start, end, are_dates = limits_of("start", options.get("start"), "end", options.get("end"))
+    wait_s = options.get("max_wait", 1.0)
+    job = replace(
+        job,
+        # By the text of a float: 29.97 means 2997/100, not the nearest binary number.
+        rate=None if rate is None else parse_rate(str(rate)),
+        slices=check_slices("slices", options.get("slices", 1)),
+        layout=layout,
+        sort=check_sort("sort", options.get("sort", "columns"), layout),
+        split=options.get("split", False),
+        keep_partial=options.get("keep_partial", False),
+        keep_repeated=options.get("keep_repeated", False),
+        drop_incomplete=drop_incomplete,
+        max_wait_ns=wait_ns("max_wait", wait_s, wait_s),
+        start=start,
+        end=end,
+        limits_are_dates=are_dates,
+        min_range_m=low,
+        max_range_m=high,
+        boxes_m=tuple(_box(box) for box in options.get("exclude_boxes", ())),
+        batching=options.get("batching", "window"),
+        batching_times=options.get("batching_times", "common"),
+        deskew=str(path_of("deskew", options.get("deskew")) or ""),
+        deskew_to=choice("deskew_to", deskew_to or INSTANTS[0], INSTANTS),
+    )
+    return check_deskew(check_batching(job), deskew_to is not None)
 
 
 def _box(values: Box) -> tuple[float, ...]:

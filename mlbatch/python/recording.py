@@ -6,12 +6,11 @@ Everything is read when it is asked for. Each iterator is a pass of its own over
 from __future__ import annotations
 
 import contextlib
-import math
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from operator import index as whole_number
 from pathlib import Path
-from typing import SupportsIndex
+from typing import TYPE_CHECKING, SupportsIndex
 
 import numpy as np
 
@@ -28,10 +27,21 @@ from mlbatch.pipeline.ingest import Ingest
 from mlbatch.pipeline.job import DEFAULT_RATE, Job
 from mlbatch.pipeline.session import Session
 from mlbatch.pipeline.time_limits import time_limit
-from mlbatch.python.options import AnyPath, Box, Moment, Rate, ScanOptions
+from mlbatch.python.options import (
+    Moment,
+    Rate,
+    WindowOptions,
+    check_names,
+    documented,
+    window_job,
+)
 from mlbatch.readers import merge, open_recordings
 from mlbatch.types import ImuSamples, StreamTable
 from mlbatch.units import NS_PER_S
+
+if TYPE_CHECKING:
+    # In `typing` from Python 3.11 on.
+    from typing_extensions import Unpack
 
 # `print` reads recordings up to this size to their end, for their duration.
 _MEASURED_BYTES = 256 << 20
@@ -158,55 +168,16 @@ class Recording:
 
     # -- scans --------------------------------------------------------------------------------
 
-    def scans(
-        self,
-        rate: Rate | None = None,
-        *,
-        start: Moment | None = None,
-        end: Moment | None = None,
-        slices: int = 1,
-        layout: str = "dense",
-        sort: str = "columns",
-        split: bool = False,
-        keep_partial: bool = False,
-        drop_incomplete: float = 0.0,
-        max_wait: float = 1.0,
-        min_range: float = 0.0,
-        max_range: float = math.inf,
-        exclude_boxes: Iterable[Box] = (),
-        keep_repeated: bool = False,
-        batching: str = "window",
-        batching_times: str = "common",
-        deskew: AnyPath | None = None,
-        deskew_to: str | None = None,
-    ) -> Iterator[Scan]:
+    @documented(WindowOptions)
+    def scans(self, rate: Rate | None = None, **options: Unpack[WindowOptions]) -> Iterator[Scan]:
         """Yield the scans that `convert` would write, each with arrays of its own.
 
-        Arguments are the options of `mlbatch convert`; start, end: ns of the common clock, or a
+        Options are those of `mlbatch convert`; start, end: ns of the common clock, or a
         text (ISO time, epoch seconds, "+5s" after the first scan). Raises MlbatchError where the
         command ends with an error, at the latest after the last scan.
         """
-        options = ScanOptions(
-            rate=rate,
-            start=start,
-            end=end,
-            slices=slices,
-            layout=layout,
-            sort=sort,
-            split=split,
-            keep_partial=keep_partial,
-            drop_incomplete=drop_incomplete,
-            max_wait=max_wait,
-            min_range=min_range,
-            max_range=max_range,
-            exclude_boxes=exclude_boxes,
-            keep_repeated=keep_repeated,
-            batching=batching,
-            batching_times=batching_times,
-            deskew=deskew,
-            deskew_to=deskew_to,
-        )
-        return scans_of(options.apply(self.job))
+        check_names("Recording.scans", options, WindowOptions)
+        return scans_of(window_job(self.job, {**options, "rate": rate}))
 
     def __iter__(self) -> Iterator[Scan]:
         """All scans, at the rate of the rig, else at 10 Hz."""
@@ -237,7 +208,7 @@ class Recording:
         limit, is_date = time_limit("at", moment)
         if limit is None:
             raise UsageError("at: expected a time, found None; give ns or an ISO time")
-        job = ScanOptions(rate=rate).apply(self.job)
+        job = window_job(self.job, {"rate": rate})
         grid = Grid(job.rate or self._rate)
         if limit.from_t_init:
             # The only window of two that contains the time is not known before t_init is.
@@ -261,7 +232,7 @@ class Recording:
 
         `pandas.DataFrame(rec.table())` is a table of pandas. Empty cells: -1, or NaN.
         """
-        run = Conversion(ScanOptions(rate=rate).apply(self.job))
+        run = Conversion(window_job(self.job, {"rate": rate}))
         for _ in run.scans():
             pass
         if run.table is None:
@@ -326,9 +297,16 @@ class Recording:
 
 
 def scans_of(job: Job) -> Iterator[Scan]:
-    """Yield the scans of a job, each with arrays of its own."""
-    for scan, _ in Conversion(job).scans():
-        yield Scan.copied(scan)
+    """Yield the scans of a job, each with arrays of its own; the first 10 s are read at once."""
+    return _copied(Conversion(job))
+
+
+def _copied(run: Conversion) -> Iterator[Scan]:
+    for scan, only in run.scans():
+        found = Scan.copied(scan)
+        if only is not None:
+            found.sensor = found.sensors[only]
+        yield found
 
 
 def _last_of(job: Job) -> Scan | None:

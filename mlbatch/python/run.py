@@ -6,12 +6,12 @@ import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal
 
 from mlbatch.pipeline import preflight, resume
 from mlbatch.pipeline.job import Job, check_max_bag_s
 from mlbatch.pipeline.resume import ResumeLog
 from mlbatch.pipeline.run import convert
+from mlbatch.python.options import OutputOptions, choice, names_of, path_of
 from mlbatch.report.ledger import SensorLedger
 from mlbatch.report.report import (
     RunReport,
@@ -22,7 +22,7 @@ from mlbatch.report.report import (
     summary_lines,
 )
 from mlbatch.report.scan_table import ScanStatistics
-from mlbatch.types import RunInfo
+from mlbatch.types import INSTANTS, RunInfo
 from mlbatch.writers import (
     ScanWriter,
     WriterOptions,
@@ -111,33 +111,24 @@ class Run:
     report_path: Path | None
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class OutputOptions:
-    """Options of the output, as those of `mlbatch convert`."""
-
-    format: str | None = None
-    point_layout: str = "standard"
-    compression: str = "none"
-    ply_style: str = "standard"
-    max_bag_duration: float = 0.0  # s of recording in a file of a bag; 0: all in one file
-    overwrite: bool = False
-    fsync: bool = True  # wait until the output is on the disk
-    report: Path | None = None
-    jobs: int | Literal["auto"] = "auto"
-
-
 def run_job(job: Job, output: Path | None, options: OutputOptions) -> Run:
     """Convert to `output` (None: a dry run); the report is written as by the command."""
-    asked = parse_jobs("jobs", str(options.jobs))
-    name = choose_format(output or Path("scans.mcap"), options.format)
-    job = replace(job, max_bag_s=check_max_bag_s("max_bag_duration", options.max_bag_duration))
+    asked = parse_jobs("jobs", str(options.get("jobs", "auto")))
+    report = path_of("report", options.get("report"))
+    name = choose_format(output, options.get("format"))
+    job = replace(
+        job,
+        passed=names_of(options.get("copy_topics", ())),
+        stamp=choice("stamp", options.get("stamp", INSTANTS[0]), INSTANTS),
+        max_bag_s=check_max_bag_s("max_bag_duration", options.get("max_bag_duration", 0.0)),
+    )
     writer_options = WriterOptions(
-        options.point_layout,
-        options.overwrite,
+        options.get("point_layout", "standard"),
+        options.get("overwrite", False),
         job.split,
-        compression=options.compression,
-        ply_style=options.ply_style,
-        fsync=options.fsync,
+        compression=options.get("compression", "none"),
+        ply_style=options.get("ply_style", "standard"),
+        fsync=options.get("fsync", True),
         max_bag_s=job.max_bag_s,
     )
     check_options(name, writer_options)
@@ -145,11 +136,11 @@ def run_job(job: Job, output: Path | None, options: OutputOptions) -> Run:
     jobs = jobs_for(asked, name, writer_options) if output is not None else asked or 1
     job = replace(job, extras=extras(name, writer_options), jobs=jobs)
     if output is None:
-        preflight.check_report(job, options.report, None, name)
+        preflight.check_report(job, report, None, name)
         _, content = convert(job, None)
-        if options.report is not None:
-            write_text(options.report, report_text(content))
-        return Run(None, Report(content), options.report)
+        if report is not None:
+            write_text(report, report_text(content))
+        return Run(None, Report(content), report)
     preflight.check_output(job, output, name)
     job = replace(job, record=record_layout(name, writer_options))
     # Also locks the output against other runs.
@@ -158,7 +149,7 @@ def run_job(job: Job, output: Path | None, options: OutputOptions) -> Run:
     check_target(name, output, writer_options, job.layout)
     if shortage := preflight.check_disk(job, output):
         warnings.warn(shortage, stacklevel=3)
-    report_path = options.report or report_paths(output, name).report
+    report_path = report or report_paths(output, name).report
     preflight.check_report(job, report_path, output, name)
     is_inside = report_path.parent.absolute() == output.absolute()
 
@@ -167,8 +158,8 @@ def run_job(job: Job, output: Path | None, options: OutputOptions) -> Run:
 
     def write_report(content: RunReport, partial: Path) -> None:
         path = partial / report_path.name if is_inside else report_path
-        write_text(path, report_text(content), options.fsync)
-        if options.fsync and path.parent.absolute() != output.parent.absolute():
+        write_text(path, report_text(content), writer_options.fsync)
+        if writer_options.fsync and path.parent.absolute() != output.parent.absolute():
             sync_entries(path.parent)
 
     _, content = convert(job, opener, None, log, write_report)

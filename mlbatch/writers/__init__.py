@@ -100,8 +100,13 @@ def plugin(name: str) -> WriterModule:
     return format_module(name)
 
 
-def choose_format(target: Path, asked: str | None) -> str:
-    """Return the format of the output `target`; asked: value of `--format`, None if not given."""
+def choose_format(target: Path | None, asked: str | None) -> str:
+    """Return the format of the output `target`; asked: value of `--format`, None if not given.
+
+    A dry run without an output decodes what a .mcap would contain.
+    """
+    if target is None:
+        return plugin(asked or "mcap").FORMAT
     suffix = target.suffix.lower()
     found = _format_of_suffix(suffix)
     if found is None:

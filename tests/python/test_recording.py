@@ -305,3 +305,21 @@ def test_importing_the_package_loads_nothing() -> None:
         "print(mlbatch.verify is __import__('mlbatch.verify').verify, callable(mlbatch.verify))\n"
     )
     assert printed.splitlines() == ["[]", "True True"]
+
+
+def test_a_missing_recording_is_named_at_the_call() -> None:
+    with pytest.raises(RecordingError, match=r"none\.pcap: expected a recording, found no such"):
+        mlbatch.scans("none.pcap")
+    with pytest.raises(UsageError, match="layout: expected dense or organized"):
+        mlbatch.scans("none.pcap", layout="sparse")
+
+
+def test_the_part_of_a_sensor_names_that_alone(rec: Recording) -> None:
+    scan = rec[0]
+    assert "points of left, right, " in repr(scan)
+    assert "points of left, 1" in repr(scan["left"])
+    assert "points of right, 1" in repr(scan["right"])
+    assert {one.sensor: repr(one).split()[5] for one in rec.scans(split=True)} == {
+        "left": "left,",
+        "right": "right,",
+    }

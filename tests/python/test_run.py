@@ -88,7 +88,7 @@ def test_a_run_without_a_scan_leaves_nothing(tmp_path: Path) -> None:
 
 def test_options_of_an_opened_recording_are_given_there(tmp_path: Path) -> None:
     rec = mlbatch.open(CAPTURE, rig=RIG)
-    with pytest.raises(UsageError, match=r"give them to mlbatch\.open"):
+    with pytest.raises(UsageError, match=r"give it to mlbatch\.open"):
         mlbatch.convert(rec, tmp_path / "scans.mcap", rig=RIG)
     with pytest.raises(UsageError, match="jobs: expected 1 to 64, or auto, found 0"):
         mlbatch.convert(rec, tmp_path / "scans.mcap", jobs=0)
