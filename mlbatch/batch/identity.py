@@ -7,7 +7,6 @@ their content. Of rigs and calibrations the whole content counts.
 from __future__ import annotations
 
 import hashlib
-import re
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
@@ -19,12 +18,6 @@ from mlbatch.errors import MlbatchError, RecordingError
 CONTENT = "content"
 TIMES = "times"
 _DIGITS = 16
-# Files next to a recording that may be calibrations: as `convert` looks for them.
-LARGEST_CALIBRATION = 2_000_000
-CALIBRATION_SUFFIXES = (".csv", ".dat", ".json", ".xml", ".yaml", ".yml")
-# Documents of mlbatch: manifests, reports, golden files.
-_DOCUMENT = re.compile(rb"schema\W{1,5}mlbatch\.")
-_HEAD_BYTES = 256
 _END_BYTES = 1 << 16
 _BLOCKS = 16
 
@@ -156,18 +149,11 @@ def _rig(rig: str) -> str:
 
 def _calibrations(recordings: list[Path]) -> str:
     """Digest of all files that may be calibrations in the folders of recordings."""
+    from mlbatch.discovery.probe import may_be_calibration
+
     digest = hashlib.sha256()
     for folder in sorted({path.resolve().parent for path in recordings}):
         for file in sorted(folder.iterdir()):
-            if _may_be_calibration(file):
+            if may_be_calibration(file):
                 digest.update(f"{file.name} {_digest(file)}\n".encode())
     return digest.hexdigest()[:_DIGITS]
-
-
-def _may_be_calibration(file: Path) -> bool:
-    if file.suffix.lower() not in CALIBRATION_SUFFIXES or not file.is_file():
-        return False
-    if file.stat().st_size > LARGEST_CALIBRATION:
-        return False
-    with file.open("rb") as opened:
-        return not _DOCUMENT.search(opened.read(_HEAD_BYTES))

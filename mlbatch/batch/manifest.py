@@ -10,6 +10,7 @@ from pathlib import Path, PurePosixPath
 
 from mlbatch.batch.session import Option, Session, check_name, check_unique, is_url
 from mlbatch.errors import RecordingError, RigError, UsageError
+from mlbatch.readers.datasets import BAG_METADATA
 from mlbatch.rig.yaml_tree import Node, read_yaml
 
 SCHEMA = "mlbatch.batch/1"
@@ -20,7 +21,6 @@ _FIELDS = re.compile(r"\{(\w*)\}")
 _TEMPLATE_WORDS = ("folder", "stem", "name")
 # Files of a folder that are recordings; gzip and zstd of them, too.
 _RECORDINGS = re.compile(r".*\.(pcap|pcapng|cap|mcap|bag|db3)(\.gz|\.zst|\.zstd)?", re.IGNORECASE)
-_BAG_METADATA = "metadata.yaml"
 # Not looked into before they are fetched: objects with these names are no recordings.
 _DOCUMENTS = re.compile(r".*\.(json|ya?ml|csv|dat|tum|txt|md|log|html)", re.IGNORECASE)
 # Names that a message shows.
@@ -179,14 +179,14 @@ def _inputs(match: str) -> tuple[str, ...]:
 
         return tuple(url for url in inside(match) if _RECORDINGS.fullmatch(url))
     path = Path(match)
-    if not path.is_dir() or (path / _BAG_METADATA).is_file():
+    if not path.is_dir() or (path / BAG_METADATA).is_file():
         return (match,)
     entries = sorted(path.iterdir())
     return tuple(
         str(entry)
         for entry in entries
         if (_RECORDINGS.fullmatch(entry.name) and entry.is_file())
-        or (entry / _BAG_METADATA).is_file()
+        or (entry / BAG_METADATA).is_file()
     )
 
 

@@ -18,7 +18,6 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
-from mlbatch.batch.identity import CALIBRATION_SUFFIXES, LARGEST_CALIBRATION
 from mlbatch.errors import MlbatchError, RecordingError, UsageError, install_extra
 
 T = TypeVar("T")
@@ -171,14 +170,16 @@ def describe(urls: Sequence[str]) -> Iterator[str]:
 
 
 def calibrations(url: str) -> list[RemoteFile]:
-    """Files in the folder of a recording that may be calibrations."""
+    """Files in the folder of a recording that may be calibrations, as `convert` looks for them."""
+    from mlbatch.discovery.probe import CALIBRATION_SUFFIXES, MAX_CALIBRATION_FILE_BYTES
+
     folder = url.rpartition("/")[0]
     return [
         one
         for one in listed(folder)
         if one.url.rpartition("/")[0] == folder
         and one.name.lower().endswith(CALIBRATION_SUFFIXES)
-        and one.size <= LARGEST_CALIBRATION
+        and one.size <= MAX_CALIBRATION_FILE_BYTES
     ]
 
 

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import contextlib
 import difflib
+import re
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -22,6 +23,7 @@ from mlbatch.errors import MlbatchError, RigError
 from mlbatch.frames.naming import nearest_topic
 from mlbatch.lidar.interface import Calibration, Evidence, Lidar
 from mlbatch.readers import has_packets, merge
+from mlbatch.readers.datasets import BAG_METADATA
 from mlbatch.rig.rig import Rig, RigSensor
 from mlbatch.types import Message, PacketBatch, Recording, StreamTable, Topic
 from mlbatch.units import NS_PER_S
@@ -39,7 +41,9 @@ CALIBRATION_SUFFIXES = (".csv", ".dat", ".json", ".xml", ".yaml", ".yml")
 METADATA_SUFFIX = ".json"
 # Well above any calibration of one sensor; larger tables of a dataset are not opened.
 MAX_CALIBRATION_FILE_BYTES = 2_000_000
-BAG_METADATA = "metadata.yaml"
+# Documents of mlbatch: manifests, reports, golden files.
+_DOCUMENT = re.compile(rb"schema\W{1,5}mlbatch\.")
+_HEAD_BYTES = 256
 
 TRANSFORM_TYPES = ("tf2_msgs/TFMessage", "tf/tfMessage")
 TEXT_TYPE = "std_msgs/String"
@@ -190,7 +194,7 @@ def find_calibrations(
     found: list[Calibration] = []
     examined: list[Path] = []
     for folder in dict.fromkeys(map(_calibration_folder, recordings)):
-        for path in sorted(path for path in folder.iterdir() if _may_be_calibration(path)):
+        for path in sorted(path for path in folder.iterdir() if may_be_calibration(path)):
             # The user did not name this file, so that an unusable one is no error.
             try:
                 calibration = sensors.read_calibration(path)
@@ -230,9 +234,14 @@ def _calibration_folder(recording: Path) -> Path:
     return folder.parent if (folder / BAG_METADATA).is_file() else folder
 
 
-def _may_be_calibration(path: Path) -> bool:
-    has_suffix = path.suffix.lower() in CALIBRATION_SUFFIXES and path.name != BAG_METADATA
-    return has_suffix and path.is_file() and path.stat().st_size <= MAX_CALIBRATION_FILE_BYTES
+def may_be_calibration(path: Path) -> bool:
+    """Whether a file next to a recording may be a calibration, by name, size and first bytes."""
+    if path.suffix.lower() not in CALIBRATION_SUFFIXES or path.name == BAG_METADATA:
+        return False
+    if not path.is_file() or path.stat().st_size > MAX_CALIBRATION_FILE_BYTES:
+        return False
+    with path.open("rb") as file:
+        return not _DOCUMENT.search(file.read(_HEAD_BYTES))
 
 
 # -- metadata messages ----------------------------------------------------------------------------

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from mlbatch.bounded import open_file, parse_json
-from mlbatch.errors import ExportError
+from mlbatch.errors import ExportError, RecordingError
 from mlbatch.page.values import Values
 from mlbatch.verify.folders import refuse_shard
 from mlbatch.verify.report_checks import REPORT, SCHEMA, TABLE, ReportPlaces
@@ -105,11 +105,32 @@ def _of_output(path: Path, report: Path | None) -> Source:
         text = inner_report if text is None else text
         table = inner_table if table is None else table
     if text is None:
+        container = _container(path)
+        if container:
+            raise ExportError(
+                f"{path}: expected an output with its report, found {container} without one; "
+                f"convert a recording first (mlbatch convert {path} -o scans.mcap), or give the "
+                "report with --report"
+            )
         raise ExportError(
             f"{path}: expected a report in or next to the output, found none; give it with "
-            "--report, or convert again"
+            "--report, or convert the recording"
         )
     return Source(read_report(places.report, text), table, path, page_of(path))
+
+
+def _container(path: Path) -> str:
+    """What recording a file may be; "" for others."""
+    if path.is_dir():
+        return ""
+    from mlbatch.readers import readers
+    from mlbatch.readers.source import read_head
+
+    try:
+        head = read_head(path)
+    except RecordingError:
+        return ""
+    return next((one.CONTAINER for one in readers() if one.recognises(head)), "")
 
 
 def _inside(path: Path) -> tuple[str | None, str | None]:

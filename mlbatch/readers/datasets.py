@@ -7,6 +7,8 @@ from itertools import islice
 from pathlib import Path
 from typing import NamedTuple
 
+# Of a ROS 2 bag, in its folder.
+BAG_METADATA = "metadata.yaml"
 # Files and folders in a folder that are looked at.
 _LOOKED_AT = 1000
 
@@ -78,6 +80,8 @@ DATASET_FILES = (
 def found_in_file(path: Path, head: bytes) -> str:
     """`found X; remedy` for a file that is no recording; "" where it is not known."""
     name = path.name.lower()
+    if name == BAG_METADATA:
+        return f"found the description of a bag; name its folder {path.parent}"
     for one in DATASET_FILES:
         if (one.magic and head.startswith(one.magic)) or name.endswith(one.suffixes):
             return f"found {one.found}; {one.remedy}"

@@ -52,6 +52,16 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (folder / "folders").mkdir()
     (folder / "old").mkdir()
     (folder / "old" / "diary.txt").touch()
+    for bag in ("bag1", "bag2"):
+        (folder / "above" / bag).mkdir(parents=True)
+        (folder / "above" / bag / f"{bag}_0.db3").touch()
+        (folder / "above" / bag / "metadata.yaml").write_text("rosbag2_bagfile_information: {}\n")
+    (folder / "above" / "map.pcd").write_text("# .PCD v0.7\n")
+    (folder / "documents").mkdir()
+    (folder / "documents" / "capture.pcap").write_bytes((FIXTURE / "two_lidars.pcap").read_bytes())
+    for document, schema in (("x.mcap.report", "report"), ("golden", "digest")):
+        text = f'{{\n "schema": "mlbatch.{schema}/1",\n "sensors": []\n}}\n'
+        (folder / "documents" / f"{document}.json").write_text(text)
     if RECORDINGS.is_dir():
         (folder / "R").symlink_to(RECORDINGS.resolve())
     _write_sessions(folder)
@@ -165,6 +175,46 @@ def test_a_url_without_the_extra(
     pattern = ".*".join(map(re.escape, message.split("{*}")))
     assert re.fullmatch(f"mlbatch: error: {pattern}\n", outcome.err), outcome.err
     assert (outcome.code, outcome.out) == (code, "")
+
+
+# What is given instead of another thing: (command, message).
+INSTEAD = {
+    "folder above a bag": (
+        "convert above -o out",
+        "above: expected a recording, found a folder with folders of bags (bag1, bag2); name "
+        "above/bag1",
+    ),
+    "description of a bag": (
+        "inspect above/bag1/metadata.yaml",
+        "above/bag1/metadata.yaml: expected a recording, found the description of a bag; name its "
+        "folder above/bag1",
+    ),
+    "page of a recording": (
+        "report fix/two_lidars.pcap",
+        "fix/two_lidars.pcap: expected an output with its report, found pcap without one; convert "
+        "a recording first (mlbatch convert fix/two_lidars.pcap -o scans.mcap), or give the report "
+        "with --report",
+    ),
+    "page of a bag": (
+        "report above/bag1",
+        "above/bag1: expected a report in or next to the output, found none; give it with "
+        "--report, or convert the recording",
+    ),
+    "own documents as metadata": (
+        "convert documents/capture.pcap -o out",
+        "documents/capture.pcap: {*}found none in the recording's directory; give {*}",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", INSTEAD)
+def test_the_right_thing_is_named(shell: Shell, place: Path, name: str) -> None:
+    command, message = INSTEAD[name]
+    outcome = shell(command)
+    pattern = ".*".join(map(re.escape, message.split("{*}")))
+    assert re.fullmatch(f"mlbatch: error: {pattern}\n", outcome.err), outcome.err
+    assert (outcome.code, outcome.out) == (1, "")
+    assert place.is_dir()
 
 
 def test_ambiguous_metadata_name_their_files(shell: Shell, place: Path) -> None:

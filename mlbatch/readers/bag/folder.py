@@ -12,10 +12,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from mlbatch.errors import RecordingError, RigError
-from mlbatch.readers.datasets import found_in_folder
+from mlbatch.readers.datasets import BAG_METADATA, found_in_folder
 
 _BAG_FILE = re.compile(r"\.(db3|mcap)(\.(zstd|zst|gz))?$", re.IGNORECASE)
-_METADATA = "metadata.yaml"
+# Folders of bags that an error names.
+_SHOWN = 3
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,6 +38,12 @@ def bag_folder(folder: Path) -> BagFolder:
             "check its access rights"
         ) from err
     if not files:
+        bags = [path.name for path in inside if path.is_dir() and _has_bag(path)]
+        if bags:
+            raise RecordingError(
+                f"{folder}: expected a recording, found a folder with folders of bags "
+                f"({', '.join(bags[:_SHOWN])}); name {folder / bags[0]}"
+            )
         known = found_in_folder(folder)
         if known:
             raise RecordingError(f"{folder}: expected a recording, {known}")
@@ -49,7 +56,14 @@ def bag_folder(folder: Path) -> BagFolder:
     whole = [path for path in files if path.suffix in (".db3", ".mcap") or path.stem not in names]
     filled = [path for path in whole if path.stat().st_size] or whole[:1]
     notes = [f"{path.name}: has 0 bytes and is left out" for path in whole if path not in filled]
-    return BagFolder(tuple(filled), (*notes, *_stale(folder / _METADATA, names, filled)))
+    return BagFolder(tuple(filled), (*notes, *_stale(folder / BAG_METADATA, names, filled)))
+
+
+def _has_bag(folder: Path) -> bool:
+    try:
+        return any(_BAG_FILE.search(path.name) for path in folder.iterdir())
+    except OSError:
+        return False
 
 
 def _natural(name: str) -> list[tuple[int, str]]:
