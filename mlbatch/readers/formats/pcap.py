@@ -37,6 +37,7 @@ _FILE_HEADER_BYTES = 24
 _LINK_AT = 20
 _RECORD_BYTES = 16
 _LENGTH_AT = 8
+_ZEROS = "expected a record, found zeros"
 # Shorter than the headers of any UDP packet.
 _LEAST_FRAME = 14
 # After this many frames of one length in a row, more are likely.
@@ -60,6 +61,12 @@ def open_packets(path: Path, streams: StreamTable) -> Recording:
         raise RecordingError(
             f"{path}: expected a pcap header of {_FILE_HEADER_BYTES} bytes, found {len(head)} "
             f"({head[:8].hex(' ')}); record or copy it again"
+        )
+    record = head[_FILE_HEADER_BYTES : _FILE_HEADER_BYTES + _RECORD_BYTES]
+    if record == bytes(_RECORD_BYTES):
+        raise RecordingError(
+            f"{path}: {_ZEROS} at byte {_FILE_HEADER_BYTES}; nothing was recorded, or the disk was "
+            "full: record or copy it again"
         )
     order, unit_ns = _MAGIC[head[:4]]
     link = struct.unpack_from(order + "I", head, _LINK_AT)[0] & 0xFFFF
@@ -128,8 +135,12 @@ class _Walker:
         """The frames in `data[begin:end]`, as far as their records are complete."""
         begin += self.skip
         self.skip = 0
-        if self.loops is not None:
-            return self._walk_by(self.loops, data, begin, end)
+        if self.loops is None:
+            return _up_to_zeros(self._walk(data, begin, end))
+        return _up_to_zeros(self._walk_by(self.loops, data, begin, end))
+
+    def _walk(self, data: U8Array, begin: int, end: int) -> Walk:
+        """The same without compiled loops."""
         starts = self._starts(data, begin, end)
         record = records(data, self.layout, starts)
         captured = record["captured"].astype(np.int64)
@@ -153,7 +164,7 @@ class _Walker:
         return Walk(place, _RECORD_BYTES + more, frames=frames)
 
     def _walk_by(self, loops: CaptureLoops, data: U8Array, begin: int, end: int) -> Walk:
-        """The same by compiled loops; at most as many frames as they have room for."""
+        """The frames by compiled loops; at most as many frames as they have room for."""
         records, place, why = loops.walk(
             data, begin, end, self.is_swapped, self.unit_ns, MAX_FRAME_BYTES
         )
@@ -204,6 +215,20 @@ class _Walker:
         others = (lengths != length).nonzero()[0]
         run = int(others[0]) if len(others) else count
         return begin + step * np.arange(run)
+
+
+def _up_to_zeros(walk: Walk) -> Walk:
+    """End a walk at a record of zeros, which nobody wrote: the disk was full, or power failed."""
+    frames = walk.frames
+    if frames.captured.all():
+        return walk
+    is_zero = (frames.captured == 0) & (frames.original == 0) & (frames.host_ns == 0)
+    rows = np.flatnonzero(is_zero)
+    if not len(rows):
+        return walk
+    first = int(rows[0])
+    place = int(frames.start[first]) - _RECORD_BYTES
+    return Walk(place, fault=_ZEROS, frames=frames.take(slice(0, first)))
 
 
 def _too_long(size: int) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gzip
 import struct
 from pathlib import Path
 
@@ -226,3 +227,35 @@ def test_builders_agree_with_the_header_lengths() -> None:
     # 14 Ethernet + 20 IPv4 + 8 UDP + 5; SLL 16 and SLL2 20 in Ethernet's place.
     sizes = [len(captures.udp_frame(b"12345", link=link)[0]) for link in (ETHERNET, SLL, SLL2)]
     assert sizes == [47, 49, 53]
+
+
+@pytest.mark.parametrize("engine", ["numpy", "native"])
+@pytest.mark.parametrize("zeros", [16, 40, 5_000_000])
+def test_zeros_after_the_last_record_end_a_capture(tmp_path: Path, zeros: int, engine: str) -> None:
+    """A full disk or a power cut leaves them: 16 would be a record at 1970 without a byte."""
+    (frame,) = udp_frame(PAYLOAD)
+    whole = pcap_bytes([(T0_NS, frame)] * 3)
+    (tmp_path / "a").write_bytes(whole + bytes(zeros))
+    recording = open_capture(tmp_path / "a")
+    recording.use_engine(engine)
+    assert len(read(recording)) == 3
+    assert recording.notes == [
+        f"byte {len(whole)}: expected a record, found zeros; the rest of the file was not read"
+    ]
+    assert recording.counts.skipped == {"truncated": 1}
+
+
+@pytest.mark.parametrize("suffix", ["", ".gz"])
+def test_a_capture_of_zeros_is_refused_at_its_first_record(tmp_path: Path, suffix: str) -> None:
+    """Not read to its end, which may be 5 GB away in a small file."""
+    data = pcap_bytes([]) + bytes(1 << 20)
+    path = tmp_path / f"a.pcap{suffix}"
+    path.write_bytes(gzip.compress(data) if suffix else data)
+    with pytest.raises(RecordingError, match=r"expected a record, found zeros at byte 24; nothing"):
+        open_capture(path)
+
+
+def test_a_frame_without_bytes_at_a_time_is_one(tmp_path: Path) -> None:
+    data = pcap_bytes([(T0_NS, b"")]) + pcap_bytes([(T0_NS, udp_frame(PAYLOAD)[0])])[24:]
+    (tmp_path / "b").write_bytes(data)
+    assert len(read(open_capture(tmp_path / "b"))) == 1
