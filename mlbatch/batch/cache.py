@@ -109,7 +109,7 @@ def _is_copy(note: IO[str], version: str, target: Path) -> bool:
 
 
 def _digest(text: str) -> str:
-    return hashlib.sha256(text.encode()).hexdigest()[:16]
+    return hashlib.sha256(text.encode(errors="surrogateescape")).hexdigest()[:16]
 
 
 def _last_used(note: Path) -> int:

@@ -155,5 +155,5 @@ def _calibrations(recordings: list[Path]) -> str:
     for folder in sorted({path.resolve().parent for path in recordings}):
         for file in sorted(folder.iterdir()):
             if may_be_calibration(file):
-                digest.update(f"{file.name} {_digest(file)}\n".encode())
+                digest.update(f"{file.name} {_digest(file)}\n".encode(errors="surrogateescape"))
     return digest.hexdigest()[:_DIGITS]

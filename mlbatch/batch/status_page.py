@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from html import escape
 from importlib import resources
 from pathlib import Path
@@ -132,12 +133,10 @@ def _row(path: Path, status: BatchStatus, one: SessionStatus) -> str:
 def _link(path: Path, status: BatchStatus, page: str) -> str:
     """A page as seen from this one."""
     if "://" in status.output:
-        return escape(quote(page), quote=True)
-    import os
-
+        return escape(quote(os.fsencode(page)), quote=True)
     target = Path(status.output) / page
     relative = os.path.relpath(target.resolve(), path.resolve().parent)
-    return escape(quote(relative), quote=True)
+    return escape(quote(os.fsencode(relative)), quote=True)
 
 
 def _loss(record: SessionRecord) -> str:

@@ -61,8 +61,14 @@ class Command(TyperCommand):
             value = ctx.params.get(param.name)
             values = value if isinstance(value, (list, tuple)) else [value]
             is_path = param.type.name in _PATH_TYPES
+            name = param.human_readable_name if param.param_type_name == "argument" else ""
+            # As a path, it would be the current folder.
+            if is_path and "" in map(str, values):
+                raise UsageError(
+                    f"{name or param.opts[0]}: expected a path, found an empty word; check that "
+                    "the variable of the shell is set"
+                )
             if is_path and "-" in map(str, values) and (self.name, param.name) not in PRINTABLE:
-                name = param.human_readable_name if param.param_type_name == "argument" else ""
                 raise UsageError(
                     f"{name or param.opts[0]}: expected a path, found -: neither standard input "
                     "nor standard output can be used here; give a file or folder"

@@ -94,6 +94,10 @@ def batch(
     from mlbatch.rig.rig import read_rig
 
     _check_counts(workers=workers, retries=retries)
+    if not cache_gb > 0:
+        from mlbatch.errors import UsageError
+
+        raise UsageError(f"--cache-gb: expected more than 0 GB, found {cache_gb}; write 100")
     jobs = _jobs(jobs, workers)
     numbers = parse_part(part)
     given = Common(rig, tuple(_given(context, options, jobs)))

@@ -99,7 +99,7 @@ def inspect(
     for note in found.notes:
         typer.echo(paragraph(f"note: {note}"))
     if write_rig is not None:
-        typer.echo(f"wrote {write_rig}")
+        typer.echo(one_line(f"wrote {write_rig}"))
 
 
 def _print(*lines: str) -> None:

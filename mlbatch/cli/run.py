@@ -171,7 +171,7 @@ def _print_summary(
         _print_sensors(conversion)
     print_summary(inputs)
     if target.written is not None:
-        typer.echo(f"wrote {target.written}, report {report_path}")
+        typer.echo(one_line(f"wrote {target.written}, report {report_path}"))
 
 
 def _beyond_limits_before(target: Target, name: str) -> list[str]:

@@ -39,7 +39,7 @@ from mlbatch.discovery.probe import first_seconds, is_without_packets
 from mlbatch.discovery.router import Role
 from mlbatch.discovery.sampler import clock_watch, split_by_kind
 from mlbatch.discovery.types import DetectedSensor, PacketKind
-from mlbatch.errors import RigError
+from mlbatch.errors import RecordingError, RigError
 from mlbatch.readers import merge, open_recordings
 from mlbatch.readers.bag.clouds import CloudRecording
 from mlbatch.rig.rig import (
@@ -318,6 +318,8 @@ def inspect(
     topics = TopicCounter.subscribed(discovery.recordings, (one.topic for one in table.streams))
     measured = _measure(discovery, others, topics, progress, whole=whole)
     types = packet_types(discovery.recordings)
+    if not discovery.sampler.kinds and not types:
+        _refuse_damaged(discovery)
     streams = tuple(
         _stream_report(discovery, kind, measured, types) for kind in discovery.sampler.kinds
     )
@@ -381,6 +383,16 @@ def _selector(table: StreamTable, sensor: DetectedSensor) -> StreamSelector:
         frame_id=stream.frame_id,
         lidar_id=stream.lidar_id,
     )
+
+
+def _refuse_damaged(discovery: Discovery) -> None:
+    """Raise RecordingError if damage is all that recordings contain."""
+    for recording in discovery.recordings:
+        if not recording.topics and recording.notes:
+            raise RecordingError(
+                f"{recording.path}: expected packets or messages, found none "
+                f"({'; '.join(recording.notes)}); record or copy it again"
+            )
 
 
 def _notes(discovery: Discovery) -> Iterator[str]:

@@ -31,7 +31,10 @@ def check_page(path: Path, *, overwrite: bool) -> None:
         with open_file(path) as file:
             is_page = file.read(len(MARK)) == MARK
     except OSError as err:
-        raise ExportError(f"{path}: expected a readable file, found {err.strerror!r}") from err
+        raise ExportError(
+            f"{path}: expected a new file or an earlier page, found {err.strerror}; choose another "
+            "name for the page"
+        ) from err
     if not is_page:
         raise ExportError(
             f"{path}: expected a new file or an earlier page, found another file; choose another "

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 from pathlib import Path
 
 from mlbatch.errors import ExportError
@@ -25,12 +26,17 @@ LEAST_OUTPUT = 4
 _BYTES_PER_MB = 1_000_000
 
 
+def _real(path: Path) -> Path:
+    """A path without links; one of a loop as it is, which is refused where it is opened."""
+    return Path(os.path.realpath(path))
+
+
 def check_output(job: Job, output: Path, name: str) -> None:
     """Raise ExportError if the output would overwrite an input; name: of its format."""
     check_name(output)
-    target = output.resolve()
+    target = _real(output)
     for path in job.recordings:
-        recording = path.resolve()
+        recording = _real(path)
         if recording == target:
             raise ExportError(
                 f"{output}: expected an output that is no recording, found one of the inputs; "
@@ -41,9 +47,9 @@ def check_output(job: Job, output: Path, name: str) -> None:
                 f"{output}: expected an output outside the recordings, found one inside {path}; "
                 "choose another folder"
             )
-    own = [file.resolve() for file in _own_files(output, name)]
+    own = [_real(file) for file in _own_files(output, name)]
     for path in _read_by(job):
-        if path.resolve() in own or target in path.resolve().parents:
+        if _real(path) in own or target in _real(path).parents:
             raise ExportError(
                 f"{output}: expected an output that does not overwrite {path}, found one that "
                 "does; choose another name"
@@ -143,9 +149,9 @@ def _is_inside(path: Path, output: Path, name: str) -> bool:
 
 def _is_of(path: Path, output: Path, name: str) -> bool:
     """True if the report is a file of the output, or in a folder that is replaced."""
-    place = path.resolve()
-    own = [file.resolve() for file in _own_files(output, name)]
-    if place == report_paths(output, name).report.resolve():
+    place = _real(path)
+    own = [_real(file) for file in _own_files(output, name)]
+    if place == _real(report_paths(output, name).report):
         return False
     return place in own or any(parent in own for parent in place.parents)
 

@@ -213,7 +213,8 @@ def write_text(path: Path, text: str, fsync: bool = False) -> None:
     """
     partial = partial_path(path)
     with export_errors(path):
-        partial.write_text(text, encoding="utf-8", newline="\n")
+        # A byte of a file name that is no text: in JSON, its escape.
+        partial.write_text(text, encoding="utf-8", errors="backslashreplace", newline="\n")
         if fsync:
             sync_to_disk(partial)
         os.replace(partial, path)

@@ -230,3 +230,64 @@ def test_reports_are_read_from_standard_input_up_to_a_limit(
             "standard input: expected a report, found more than 100 bytes; give the report of "
             "`mlbatch convert`",
         )
+
+
+# -- names and words --------------------------------------------------------------------------
+
+UNSET = "expected a path, found an empty word; check that the variable of the shell is set"
+WORDS = {
+    "input": (f"convert '' -r {RIG} --dry-run", 2, f"RECORDINGS: {UNSET}"),
+    "output": (f"convert {PAIR} -o ''", 2, f"-o: {UNSET}"),
+    "rig": (f"inspect {CAPTURE} -r ''", 2, f"--rig: {UNSET}"),
+    "verified": ("verify ''", 2, f"OUTPUT: {UNSET}"),
+    "link to itself as output": (
+        f"convert {PAIR} -o loop --overwrite",
+        1,
+        "loop: expected a folder to overwrite, found none; choose another",
+    ),
+    "link to itself as input": (
+        "convert loop -o x.mcap",
+        1,
+        "loop: expected a recording, could not read it (Too many levels of symbolic links); check "
+        "the disk",
+    ),
+    "page on a device": (
+        f"convert {PAIR} --dry-run --html /dev/null",
+        1,
+        "/dev/null: expected a new file or an earlier page, found a device; choose another name "
+        "for the page",
+    ),
+    "cache of no size": (
+        f"batch {CAPTURE} -o sessions --cache-gb nan",
+        2,
+        "--cache-gb: expected more than 0 GB, found nan; write 100",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", WORDS)
+def test_words_that_name_nothing(shell: Shell, name: str) -> None:
+    Path("loop").symlink_to("loop")
+    command, code, message = WORDS[name]
+    _one_line(shell, command, code, message)
+
+
+def test_a_format_for_a_dry_run_needs_no_output(shell: Shell) -> None:
+    outcome = shell(f"convert {PAIR} --dry-run -f npz -q --report report.json")
+    assert (outcome.code, outcome.err) == (0, "")
+
+
+def test_names_that_are_no_text(shell: Shell) -> None:
+    """The bytes of a name need not be UTF-8; a direction mark is not printed as it is."""
+    Path("a\udcff.pcap").write_bytes(CAPTURE.read_bytes())
+    for command in (
+        f"convert a\udcff.pcap -r {RIG} -o b\udcff\u202e.mcap",
+        "report b\udcff\u202e.mcap",
+        f"batch a\udcff.pcap -r {RIG} -o sessions",
+        "batch-status sessions --page page.html",
+    ):
+        outcome = shell(command)
+        assert (outcome.code, outcome.err) == (0, ""), command
+        assert "\udcff" not in outcome.out
+        assert "\u202e" not in outcome.out
+    assert "a%FF" in Path("page.html").read_text(encoding="utf-8")

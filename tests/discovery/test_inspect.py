@@ -130,6 +130,21 @@ def test_a_damaged_recording_is_noted(shell: Shell, tmp_path: Path) -> None:
     )
 
 
+@pytest.mark.parametrize(
+    ("name", "head"),
+    [("a.mcap", b"\x89MCAP0\r\n"), ("a.bag", b"#ROSBAG V2.0\n")],
+)
+def test_a_recording_of_nothing_but_damage_is_an_error(
+    shell: Shell, tmp_path: Path, name: str, head: bytes
+) -> None:
+    (tmp_path / name).write_bytes(head + bytes(1 << 20))
+    outcome = shell("inspect", tmp_path / name)
+    assert (outcome.code, outcome.out) == (1, "")
+    begin = f"mlbatch: error: {tmp_path / name}: expected packets or messages, found none ("
+    assert outcome.err.startswith(begin)
+    assert f"byte {len(head)}: " in outcome.err
+
+
 def test_only_the_first_ten_seconds_are_read(shell: Shell, tmp_path: Path) -> None:
     capture = write_session(tmp_path, Unit(turns=110))
     (stream,) = _streams(shell, str(capture))

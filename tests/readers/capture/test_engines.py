@@ -68,7 +68,7 @@ def test_headers_with_any_byte_changed(tmp_path: Path) -> None:
 
 def test_more_frames_than_there_is_room_for(tmp_path: Path) -> None:
     path = tmp_path / "capture.pcap"
-    frames = [(number, b"\x00" * (number % 3)) for number in range(40_000)]
+    frames = [(1_000_000 + number, b"\x00" * (number % 3)) for number in range(40_000)]
     path.write_bytes(pcap_bytes([*frames, *((1, one) for one in udp_frame(b"last"))]))
     found = outcome(path, "native", 4 << 20)
     assert found == outcome(path, "numpy", 4 << 20)
