@@ -90,4 +90,6 @@ def read(output: AnyPath) -> Iterator[Scan]:
 def inspect(recordings: Paths, metadata: Paths = (), *, whole: bool = False) -> Inspection:
     """What the first 10 s of recordings contain (whole: all of them), as `mlbatch inspect`."""
     paths = paths_of("recording", recordings)
+    if not paths:
+        raise UsageError("recording: expected at least one path, found none; name a recording")
     return inspect_recordings(paths, paths_of("metadata", metadata), whole=whole)

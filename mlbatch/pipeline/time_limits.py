@@ -76,7 +76,12 @@ def _whole_ns(option: str, value: object) -> int:
             f"{option}: expected whole nanoseconds or a text, found {value!r}; write an int of ns, "
             "or seconds as a text"
         )
-    return index(value)
+    ns = index(value)
+    if abs(ns) > MOST_S * NS_PER_S:
+        raise UsageError(
+            f"{option}: expected nanoseconds of at most {MOST_S} s, found {ns}; correct it"
+        )
+    return ns
 
 
 def _refuse_disorder(options: tuple[str, str], first: Limit | None, last: Limit | None) -> None:

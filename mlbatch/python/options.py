@@ -255,7 +255,7 @@ def window_job(job: Job, options: RatedOptions) -> Job:
 
 
 def _box(values: Box) -> tuple[float, ...]:
-    box = tuple(map(float, values))
+    box = tuple(map(float, values)) if isinstance(values, Iterable) else ()
     if len(box) != _BOX_VALUES or not all(a < b for a, b in zip(box[:3], box[3:], strict=True)):
         raise UsageError(
             "exclude_boxes: expected (x0, y0, z0, x1, y1, z1) in metres with x0 < x1, y0 < y1, "

@@ -24,7 +24,7 @@ from mlbatch.outputs.scan import Scan
 from mlbatch.outputs.table import Rows, read_table
 from mlbatch.pipeline.conversion import Conversion
 from mlbatch.pipeline.ingest import Ingest
-from mlbatch.pipeline.job import DEFAULT_RATE, Job
+from mlbatch.pipeline.job import DEFAULT_RATE, MOST_S, Job
 from mlbatch.pipeline.session import Session
 from mlbatch.pipeline.time_limits import time_limit
 from mlbatch.python.options import (
@@ -191,6 +191,8 @@ class Recording:
         number = whole_number(index)
         if number < 0:
             raise IndexError(f"scan {number}: expected 0 or more")
+        if number * self._rate.denominator > MOST_S * self._rate.numerator:
+            raise IndexError(f"scan {number}: no such scan in {self!r}")
         # Bounds are rounded up: the start after t_init is one of two whole nanoseconds.
         exact = number * NS_PER_S * self._rate.denominator
         first = Limit(exact // self._rate.numerator, from_t_init=True)

@@ -49,7 +49,8 @@ def verify(
             f"{path}: expected an output, found no such file or folder; check the name"
         )
     log = CheckLog()
-    unfinished = path.with_name(path.name + _PARTIAL)
+    # Not by its name: `.` and `/` have none.
+    unfinished = Path(f"{path}{_PARTIAL}")
     log.ok("container")
     if unfinished.exists():
         log.fail("container", unfinished.name, "no unfinished run next to the output", "one")

@@ -11,7 +11,7 @@ import pytest
 
 import mlbatch
 from mlbatch import api
-from mlbatch.errors import UsageError
+from mlbatch.errors import MlbatchError, UsageError
 from tests.builders.sessions import FIXTURE
 from tests.contract.tree import ROOT
 
@@ -155,3 +155,18 @@ def test_options_of_sensors_belong_to_open() -> None:
         rec.scans(rig="rig.yaml")  # type: ignore[call-arg]
     with pytest.raises(UsageError, match="expected strict with paths only"):
         mlbatch.convert(rec, None, strict=True)
+
+
+def test_values_out_of_any_range(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    rec = mlbatch.open(FIXTURE / "two_lidars.pcap", rig=FIXTURE / "rig.yaml")
+    with pytest.raises(UsageError, match="start: expected nanoseconds of at most 8589934592 s"):
+        rec.scans(start=2**70)
+    with pytest.raises(UsageError, match="exclude_boxes: expected"):
+        rec.scans(exclude_boxes=[1])  # type: ignore[list-item]
+    with pytest.raises(IndexError, match="no such scan"):
+        rec[10**30]
+    with pytest.raises(UsageError, match="expected at least one path"):
+        mlbatch.inspect([])
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(MlbatchError, match="found an empty folder"):
+        mlbatch.verify(".")
