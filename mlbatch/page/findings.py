@@ -52,7 +52,7 @@ REMEDIES = {
     "clock_jump": "use --on-jump split, or --clock host",
     "host_step": "do not set the clock of the capture host during a recording",
     "max_wait": "give --max-wait in seconds",
-    "cloud_time": "state the unit of the time field in the rig (points: unit)",
+    "cloud_time": "state unit or from of points, or the clock, in the rig, as the warning says",
     "clouds": "nothing to do; check that the interpretation is correct",
 }
 _INFORMATION = frozenset({"clouds", "constant_tf"})

@@ -43,8 +43,19 @@ _FLOAT64_BYTES = 8
 _SWEEP = (0.5, 1.2)
 _LEAST_SPAN = 0.05
 _MOST_SPAN = 1.5
+# Below, points would share the time of the message if it is not a sector that the lidar sends.
+_USUAL_SPAN = 0.5
 # Points after the log time of their message that rounding, or a header with it, cannot explain.
 _AHEAD_NS = 5 * NS_PER_MS
+# Points on the other side of a stated zero: a driver stamps the first packet of a sweep or the
+# last one, whose points are measured during the next milliseconds.
+_PACKET_NS = 5 * NS_PER_MS
+# From the last point to the log time of a message: a driver publishes a sweep when it is complete.
+_USUAL_DELAY_NS = 20 * NS_PER_MS
+# Headers that much before the log time are of a clock of another zero.
+_MOST_DELAY_NS = NS_PER_S
+# Log times that are copies of headers, rounded to microseconds.
+_COPY_NS = NS_PER_US
 
 
 @dataclass(frozen=True, slots=True)
@@ -134,14 +145,45 @@ def stamps(time: Times, zero: Zero, rule: PointRule, all_times: Times) -> tuple[
             "set the clock of its driver and record again"
         )
     words = "up to" if high <= 0 > low else "after"
+    _check_direction(float(low), float(high), unit_ns, zero, rule.origin)
     if rule.origin == END:
-        ns -= max(0, _last_ns(all_times, high, unit_ns, rule.longest_ns))
         words = "up to"
-    elif rule.origin == START and low < 0:
-        ns -= int(ns.min())
-        words = "after"
+        if not _counts_back(low, high):
+            ns -= _last_ns(all_times, high, unit_ns, rule.longest_ns)
     ns += zero.base_ns
     return ns, f"{zero.field}, {unit} {words} {zero.base}{why}"
+
+
+def _counts_back(low: float, high: float) -> bool:
+    """Whether times are those before their zero, as of a sweep whose end is stamped."""
+    return low < 0 and -low > high
+
+
+def _check_direction(low: float, high: float, unit_ns: int, zero: Zero, origin: str) -> None:
+    """Refuse times on both sides of a zero that the rig says is the start or the end of a sweep."""
+    low_ns = low * unit_ns
+    high_ns = high * unit_ns
+    is_back = _counts_back(low, high)
+    if origin == START:
+        expected = f"times of 0 and more after {zero.base}, that of the first point (from: start)"
+        is_allowed = low_ns >= -_PACKET_NS
+    elif origin == END:
+        expected = (
+            f"times up to 0, back from {zero.base}, or of 0 and more, in a sweep that ends there "
+            "(from: end)"
+        )
+        is_allowed = high_ns <= _PACKET_NS if is_back else low_ns >= -_PACKET_NS
+    else:
+        return
+    if is_allowed:
+        return
+    readings = [f"remove from if they count from {zero.base} as they are"]
+    if origin == START and high_ns <= _PACKET_NS:
+        readings.insert(0, f"write from: end if {zero.base} is that of the last point")
+    raise CloudError(
+        f"field {zero.field}: expected {expected}, found {low_ns / NS_PER_MS:.3f} to "
+        f"{high_ns / NS_PER_MS:.3f} ms; {', or '.join(readings)}"
+    )
 
 
 def _last_ns(all_times: Times, high: Any, unit_ns: int, longest_ns: int) -> int:
@@ -255,11 +297,12 @@ class CloudSample:
 
 
 def checked_rule(
-    samples: Sequence[CloudSample], rule: PointRule, topic: str
+    samples: Sequence[CloudSample], rule: PointRule, topic: str, offset_ns: int | None = 0
 ) -> tuple[PointRule, list[str]]:
     """The rule by which a topic can be read, and warnings; CloudError if there is none.
 
-    samples: of messages of one lidar, as far as their ids say; rule: of the rig, or CONVENTION.
+    samples: of messages of one lidar, as far as their ids say; rule: of the rig, or CONVENTION;
+    offset_ns: what the rig adds to the times of the lidar, None where it converts their epoch.
     """
     usable = [one for one in samples if one.points > 1]
     if not usable:
@@ -299,6 +342,13 @@ def checked_rule(
             f"field {name}: expected times of points that span at least 5 % of the spacing of the "
             f"messages, found {shown}; {ways_out}"
         )
+    if _LEAST_SPAN <= share < _USUAL_SPAN and "unit" not in rule.places:
+        unit = _unit_name(found_unit.unit_ns)
+        notes.append(
+            f"field {name}: points span {shown}, {100 * share:.0f} %, as those of a sector, of "
+            f"another field or of another unit: write points: {{unit: {unit}}} in the rig if that "
+            "is right"
+        )
     if share > _MOST_SPAN and share * spacing_ns <= _LONGEST_S * NS_PER_S:
         text = (
             f"field {name}: expected sweeps of one lidar, found {shown}, which overlap: several "
@@ -310,8 +360,9 @@ def checked_rule(
                 f"rig (points: {{unit: ns}}), or leave the topic out with --ignore {topic}"
             )
         notes.append(text)
-    if not rule.origin:
-        notes += _ahead(usable, found_unit, name, spacing_ns)
+    is_absolute = found_unit.is_absolute if not rule.origin else rule.origin == ABSOLUTE
+    reading = Reading(found_unit.unit_ns, is_absolute)
+    notes += _against_log_times(usable, reading, name, offset_ns, is_stated=bool(rule.origin))
     return rule, notes
 
 
@@ -321,7 +372,7 @@ def ahead_ns(samples: Sequence[CloudSample], rule: PointRule) -> int | None:
     None where that is unknown: log times that are copies of the header's, or unreadable times.
     """
     known = [one for one in samples if one.points]
-    if not known or all(one.host_ns == one.stamp_ns for one in known):
+    if not known or _are_copies(known):
         return None
     lasts = [(_last_stamp_ns(one, rule), one.host_ns) for one in known]
     return max((last - host_ns for last, host_ns in lasts if last is not None), default=None)
@@ -337,10 +388,9 @@ def _last_stamp_ns(sample: CloudSample, rule: PointRule) -> int | None:
         return None
     if rule.origin == ABSOLUTE or (not rule.origin and reading.is_absolute):
         return round(sample.high * reading.unit_ns)
-    if rule.origin == END and sample.high > 0:
+    if rule.origin == END and not _counts_back(sample.low, sample.high):
         return sample.zero.base_ns
-    low = sample.low if rule.origin == START and sample.low < 0 else 0.0
-    return sample.zero.base_ns + round((sample.high - low) * reading.unit_ns)
+    return sample.zero.base_ns + round(sample.high * reading.unit_ns)
 
 
 def _inferred(
@@ -374,23 +424,64 @@ def _inferred(
     return replace(rule, unit_ns=unit_ns, inferred=text), _by_unit(high, unit_ns)
 
 
-def _ahead(
-    samples: Sequence[CloudSample], reading: Reading, name: str, spacing_ns: float
+def _against_log_times(
+    samples: Sequence[CloudSample],
+    reading: Reading,
+    name: str,
+    offset_ns: int | None,
+    *,
+    is_stated: bool,
 ) -> list[str]:
-    """A warning if points are later than the log time of their message."""
+    """A warning where points or headers do not fit the log times of their messages.
+
+    A message is logged after its last point, and soon after it. is_stated: the rig says what its
+    header is. Log times that are copies of the headers show nothing.
+    """
+    if offset_ns is None or _are_copies(samples):
+        return []
+    headers_ns = [one.stamp_ns + offset_ns - one.host_ns for one in samples]
+    # Of all messages: a jump of the clock is reported as such.
+    late_ns = min(headers_ns)
+    what = "the header is"
     if reading.is_absolute:
+        what = "the last points are"
+        lasts_ns = (round(one.high * reading.unit_ns) - one.host_ns for one in samples)
+        late_ns = min(lasts_ns) + offset_ns
+    if late_ns > _USUAL_DELAY_NS:
+        return [
+            f"field {name}: {what} {late_ns / NS_PER_MS:.1f} ms later than the log time of every "
+            "message, so the clock of the lidar is ahead of that of the recorder: write "
+            f"clock: {{offset_s: {(offset_ns - late_ns) / NS_PER_S:.3f}}} in the rig if the "
+            "recorder is right"
+        ]
+    if reading.is_absolute or is_stated:
         return []
-    header_ns = median(np.array([one.stamp_ns - one.host_ns for one in samples]))
-    last_ns = header_ns + median(np.array([one.high for one in samples])) * reading.unit_ns
-    # A header that is itself that late is of a clock that is ahead.
-    if last_ns <= _AHEAD_NS or header_ns >= spacing_ns:
-        return []
-    return [
-        f"field {name}: points are up to {last_ns / NS_PER_MS:.1f} ms later than the log time of "
-        "their message, as where a driver stamps the header at the end of the sweep: then write "
-        "points: {from: end} in the rig; if the header is that of the first point, write "
-        "points: {from: start}"
-    ]
+    header_ns = round(median(np.array(headers_ns)))
+    last_ns = round(median(np.array([one.high for one in samples])) * reading.unit_ns)
+    ahead_ns = header_ns + last_ns
+    states = (
+        "then write points: {from: end} in the rig; if the header is that of the first point, "
+        "write points: {from: start}"
+    )
+    if ahead_ns > _AHEAD_NS:
+        return [
+            f"field {name}: points are up to {ahead_ns / NS_PER_MS:.1f} ms later than the log time "
+            "of their message, as where a driver stamps the header at the end of the sweep: "
+            f"{states}"
+        ]
+    if last_ns > _USUAL_DELAY_NS < -ahead_ns and -header_ns <= _MOST_DELAY_NS:
+        return [
+            f"field {name}: messages are logged {-ahead_ns / NS_PER_MS:.1f} ms after their last "
+            f"point if the header is that of the first point, {-header_ns / NS_PER_MS:.1f} ms "
+            "after it if a driver stamps the header at the end of the sweep, and the log times do "
+            f"not show which: {states}"
+        ]
+    return []
+
+
+def _are_copies(samples: Sequence[CloudSample]) -> bool:
+    """Whether log times are copies of the headers' stamps."""
+    return all(abs(one.host_ns - one.stamp_ns) <= _COPY_NS for one in samples)
 
 
 def _spacing_ns(samples: Sequence[CloudSample]) -> float | None:

@@ -7,7 +7,7 @@ Every length is checked against the message's end before it is used. Times: `ros
 from __future__ import annotations
 
 import difflib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any, TypeAlias, TypeVar
@@ -53,12 +53,31 @@ _CUSTOM_POINT = np.dtype(
 _CUSTOM_STEPS = {"cdr": 20, "ros1": 19}
 
 
+# Names of fields that may rise within a scan and are no times.
+_NO_TIMES = (
+    *AXES,
+    "azimuth",
+    *(name for role in _ROLES if role != "time" for name in _ROLES[role]),
+)
+# Times rise at nearly every step at which they change, or with the number of the point.
+_MOST_FALLS = 0.05
+_LEAST_CORRELATION = 0.9
+_LEAST_RISES = 8
+
 # More points share one time only where it is not theirs; columns have fewer.
 _MOST_AT_ONCE = 1024
 
 
 class FieldError(CloudError):
     """A field that the rig names and the cloud lacks."""
+
+
+class _NoTimeError(Exception):
+    """A cloud without its field of times; text: what was expected and found."""
+
+    def __init__(self, text: str, kind: type[CloudError]) -> None:
+        super().__init__(text)
+        self.kind = kind
 
 
 @dataclass(frozen=True, slots=True)
@@ -219,7 +238,7 @@ def _custom(message: Message, rules: Rules) -> RawCloud:
         ("ring", rules(frame).ring, "line"),
     ):
         if given not in ("", own):
-            raise _unknown_field(rules(frame), key, given, (own,))
+            raise _nearest(_unknown_field(rules(frame), key, given, (own,)), given, (own,))
     zero = Zero("offset_time (uint32)", base_ns, base)
     return RawCloud(rows, zero, stamp_ns or base_ns, frame, lidar_id)
 
@@ -255,7 +274,12 @@ def _cloud2(message: Message, rules: Rules) -> RawCloud:
             f"expected {height} x {width} points of {step} bytes in rows of {row_step}, found "
             f"{size} bytes of data; the cloud was cut off, or written wrongly"
         )
-    layout, time, type_name = _layout(fields, step, rules(frame))
+    try:
+        layout, time, type_name = _layout(fields, step, rules(frame))
+    except _NoTimeError as err:
+        place = (message.data, at, (height, width), (row_step, step))
+        rising = _rising_fields(fields.fields.values(), *place)
+        raise err.kind(f"{err}; {_time_remedy(rising, err.kind)}") from err
     rows: Rows = np.ndarray((height, width), layout, message.data, at, (row_step, step))
     zero = Zero(f"{time.name} ({type_name})", stamp_ns, "the header's stamp")
     return RawCloud(rows.reshape(-1), zero, stamp_ns, frame)
@@ -321,7 +345,10 @@ def _layout(known: _FieldList, step: int, rule: PointRule) -> tuple[np.dtype[np.
         if given.get(role):
             names = (given[role],)
             if names[0] not in fields:
-                raise _unknown_field(rule, role, names[0], tuple(fields))
+                error = _unknown_field(rule, role, names[0], tuple(fields))
+                if role == "time":
+                    raise _NoTimeError(error, FieldError)
+                raise _nearest(error, names[0], tuple(fields))
         found = next((fields[name] for name in names if name in fields), None)
         if found is not None:
             chosen[role] = found
@@ -329,10 +356,10 @@ def _layout(known: _FieldList, step: int, rule: PointRule) -> tuple[np.dtype[np.
     if not all(axis in chosen for axis in AXES):
         raise CloudError(f"expected fields x, y, z, found {present}; choose a topic of points")
     if "time" not in chosen:
-        raise CloudError(
+        raise _NoTimeError(
             f"expected the time of each point in a field {', '.join(TIME_NAMES[:-1])} or "
-            f"{TIME_NAMES[-1]}, found {present}; name it in the rig (points: {{time: FIELD}}), "
-            "record the raw packets, or clouds with times"
+            f"{TIME_NAMES[-1]}, found {present}",
+            CloudError,
         )
     for role, field in chosen.items():
         _check(role, field, step)
@@ -365,14 +392,67 @@ def _check(role: str, field: _Field, step: int) -> None:
         )
 
 
-def _unknown_field(rule: PointRule, key: str, name: str, known: Sequence[str]) -> CloudError:
-    """The error for a field of the rig that the cloud lacks."""
+def _unknown_field(rule: PointRule, key: str, name: str, known: Sequence[str]) -> str:
+    """The error for a field of the rig that the cloud lacks, without a remedy."""
+    return (
+        f"{rule.at(key)}expected a field of the cloud, one of {', '.join(known) or 'none'}, found "
+        f"{name!r}"
+    )
+
+
+def _nearest(error: str, name: str, known: Sequence[str]) -> FieldError:
+    """The error with the known field whose name is nearest as remedy."""
     near = difflib.get_close_matches(name, known, n=1, cutoff=0.0)
     remedy = f"the nearest one is {near[0]}" if near else "choose a topic of points"
-    return FieldError(
-        f"{rule.at(key)}expected a field of the cloud, one of {', '.join(known) or 'none'}, found "
-        f"{name!r}; {remedy}"
+    return FieldError(f"{error}; {remedy}")
+
+
+def _time_remedy(rising: Sequence[str], kind: type[CloudError]) -> str:
+    """What to do where the times of the points were not found."""
+    instead = "record the raw packets, or clouds with times"
+    if not rising:
+        return f"none of them rises within the scan as times do: {instead}"
+    what = f"{' or '.join(rising)} rises within the scan as times do"
+    if kind is FieldError:
+        return what
+    return (
+        f"{what}: if that is it, name it in the rig (points: {{time: {rising[0]}}}), or {instead}"
     )
+
+
+def _rising_fields(
+    fields: Iterable[_Field],
+    data: bytes | memoryview,
+    at: int,
+    shape: tuple[int, int],
+    strides: tuple[int, int],
+) -> list[str]:
+    """Names of fields whose values rise with the points of a cloud (height, width)."""
+    found = []
+    for field in fields:
+        if field.name in _NO_TIMES or field.type not in _TYPES or field.count != 1:
+            continue
+        kind = np.dtype("<" + _TYPES[field.type])
+        if field.offset + kind.itemsize > strides[1] or not shape[0] * shape[1]:
+            continue
+        values = np.ndarray(shape, kind, data, at + field.offset, strides)
+        if _rises(values.reshape(-1).astype(np.float64)):
+            found.append(field.name)
+    return found
+
+
+def _rises(values: npt.NDArray[np.float64]) -> bool:
+    """Whether numbers rise as times do: mostly, or by their order."""
+    values = values[np.isfinite(values)]
+    steps = np.diff(values)
+    rises = int(np.count_nonzero(steps > 0))
+    falls = int(np.count_nonzero(steps < 0))
+    if rises < _LEAST_RISES:
+        return False
+    if falls <= _MOST_FALLS * (rises + falls):
+        return True
+    with np.errstate(over="ignore", invalid="ignore"):
+        return bool(np.corrcoef(values, np.arange(len(values)))[0, 1] >= _LEAST_CORRELATION)
 
 
 _READERS: Mapping[str, Callable[[Message, Rules], RawCloud]] = {

@@ -17,9 +17,9 @@ BAG_MISTAKES: dict[str, tuple[str, int, str]] = {
         "timeless.db3",
         1,
         "timeless.db3: /points: expected the time of each point in a field t, time, timestamp, "
-        "time_stamp, timestamps, offset_time or ts, found x, y, z; name it in the rig (points: "
-        "{time: FIELD}), record the raw packets, or clouds with times, or leave the topic out with "
-        "--ignore /points",
+        "time_stamp, timestamps, offset_time or ts, found x, y, z; none of them rises within "
+        "the scan as times do: record the raw packets, or clouds with times, or leave the topic "
+        "out with --ignore /points",
     ),
     "one of two lidars": (
         "drive.mcap --rig one.yaml",

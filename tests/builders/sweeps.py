@@ -7,7 +7,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 # numpy types of a rig, with the code of `struct`, and kind and size of PCD.
-CODES = {"i1": "b", "u1": "B", "i2": "h", "u2": "H", "i4": "i", "u4": "I", "f4": "f", "f8": "d"}
+CODES = {"i1": "b", "u1": "B", "i2": "h", "u2": "H", "i4": "i", "u4": "I", "f4": "f", "f8": "d",
+         "i8": "q", "u8": "Q"}  # fmt: skip
 KINDS = {"i": "I", "u": "U", "f": "F"}
 Point = Sequence[float]
 

@@ -247,7 +247,7 @@ def test_another_field_can_be_named(shell: Shell, tmp_path: Path) -> None:
         (
             "{time: dely}",
             "rig.yaml:4: sensors[0].points.time: expected a field of the cloud, one of x, y, z, "
-            "intensity, t, ring, found 'dely'; the nearest one is ",
+            "intensity, t, ring, found 'dely'; t rises within the scan as times do\n",
         ),
         (
             "\n      unit: ns\n      ring: rings",
@@ -265,6 +265,41 @@ def test_unknown_fields_are_named_with_their_line(shell: Shell, points: str, err
     outcome = _run(shell, _bag(_clouds(OUSTER, NS)), rig=_rig(points))
     assert outcome.code == 1
     assert outcome.err.startswith(f"mlbatch: error: {error}")
+
+
+IN_ORDER = "timestamps, offset_time or ts, found"
+
+
+@pytest.mark.parametrize("layout", ["firings", "rows of rings", "firing times"])
+def test_only_fields_that_rise_within_a_scan_are_proposed(shell: Shell, layout: str) -> None:
+    """The order of drivers: firing by firing, ring by ring, and firings that are not in order."""
+    fields = (*XYZ, ("intensity", "float32"), ("ring", "uint16"), ("gain", "uint8"))
+    stamped = (*fields, ("when", "uint32"))
+    shots = [(n, ring) for n in range(COLUMNS) for ring in range(16)]
+    if layout == "rows of rings":
+        shots.sort(key=lambda shot: (shot[1], shot[0]))
+    late = [0, 700, 300, 500] * 4 if layout == "firing times" else [0] * 16
+    points = [
+        (5, 1, 2, (7 * n + 3 * ring) % 50, ring, (5 * n + ring) % 7, n * MS + late[ring] * 1000)
+        for n, ring in shots
+    ]
+    timed = _bag([cloud_message(stamped, points, start) for start in _starts()])
+    timeless = _bag(
+        [cloud_message(fields, [one[:-1] for one in points], start) for start in _starts()]
+    )
+    for rig, what in (("", f"{IN_ORDER} x, y, z, intensity, ring, gain"), ("{time: stamp}", "")):
+        outcome = _run(shell, timed, rig=_rig(rig) if rig else "")
+        assert outcome.code == 1
+        assert what in outcome.err
+        assert "when rises within the scan as times do" in outcome.err
+        outcome = _run(shell, timeless, rig=_rig(rig) if rig else "")
+        assert outcome.code == 1
+        assert what in outcome.err
+        assert "none of them rises within the scan as times do" in outcome.err
+        for name in ("is intensity", "is gain", "points: {time", "intensity rises"):
+            assert name not in outcome.err
+    outcome = _run(shell, timed, "--strict", rig=_rig("{time: when}"))
+    assert outcome.code == 0, outcome.err
 
 
 def test_points_of_a_topic_without_clouds(shell: Shell) -> None:
@@ -368,12 +403,116 @@ def test_the_end_of_a_sweep_counts_shots_without_a_return(shell: Shell, tmp_path
     assert _stamps(tmp_path / "out")[:61] == [n * MS for n in range(61)]
 
 
-def test_times_back_from_the_end_with_a_header_of_the_start(shell: Shell, tmp_path: Path) -> None:
-    back = [n / 1024 - 0.09375 for n in range(97)]  # exact in float32
-    data = _clouds(VELODYNE, back)
-    outcome = _run(shell, _bag(data), "--strict", rig=_rig("{from: start}"))
+BACK = [n / 1024 - 0.09375 for n in range(97)]  # exact in float32
+AROUND = [n / 1024 - 0.0625 for n in range(97)]
+AS_THEY_ARE = "remove from if they count from the header's stamp as they are"
+
+
+@pytest.mark.parametrize(
+    ("times", "origin", "found"),
+    [
+        (BACK, "start", "-93.750 to 0.000 ms; write from: end if the header's stamp is that of "
+         f"the last point, or {AS_THEY_ARE}"),
+        (AROUND, "start", f"-62.500 to 31.250 ms; {AS_THEY_ARE}"),
+        (AROUND, "end", f"-62.500 to 31.250 ms; {AS_THEY_ARE}"),
+    ],
+)  # fmt: skip
+def test_times_that_the_stated_direction_excludes_are_refused(
+    shell: Shell, tmp_path: Path, times: Sequence[float], origin: str, found: str
+) -> None:
+    """They were shifted: points were 62 or 94 ms late."""
+    data = _bag(_clouds(VELODYNE, times, header=LAST), delay=LAST + 35 * MS)
+    outcome = _run(shell, data, rig=_rig(f"{{from: {origin}}}"))
+    assert outcome.code == 1
+    assert outcome.err.startswith("mlbatch: error: rig.yaml: sensor top: /points: field time")
+    assert outcome.err.endswith(f"(from: {origin}), found {found}\n")
+    # As they are: the first point is that long before the header's stamp.
+    outcome = _run(shell, data, "--strict", rig=_rig("{unit: s}"))
     assert outcome.code == 0, outcome.err
-    assert _stamps(tmp_path / "out")[0] == 0
+    assert _stamps(tmp_path / "out")[0] == LAST + round(times[0] * 1e9)
+
+
+def test_points_of_the_stamped_packet_are_on_the_other_side_of_the_header(
+    shell: Shell, tmp_path: Path
+) -> None:
+    """The Velodyne driver stamps the last packet, whose points follow for 1.3 ms."""
+    times = [n / 1024 - 0.09375 for n in range(98)]
+    data = _bag(_clouds(VELODYNE, times, header=LAST))
+    outcome = _run(shell, data, "--strict", rig=_rig("{from: end}"))
+    assert outcome.code == 0, outcome.err
+    assert _stamps(tmp_path / "out")[0] == LAST - 93_750_000
+    data = _bag(_clouds(VELODYNE, [n / 1024 - 1 / 1024 for n in range(97)]))
+    outcome = _run(shell, data, "--strict", rig=_rig("{from: start}"))
+    assert outcome.code == 0, outcome.err
+    # The first column of all is before the first window.
+    assert _stamps(tmp_path / "out")[0] in (-976_562, -976_563, 0)
+
+
+# -- log times -------------------------------------------------------------------------------------
+
+
+def test_log_times_that_fit_two_zeros_are_warned_about(shell: Shell) -> None:
+    """Header at the end, logged 120 ms later: as a header at the start, logged 23 ms later."""
+    clouds = _bag(_clouds(OUSTER, NS, header=LAST), delay=LAST + 120 * MS)
+    outcome = _run(shell, clouds)
+    assert outcome.code == 0, outcome.err
+    (code, text), _ = _warnings()
+    assert code == "cloud_time"
+    assert "logged 23.0 ms after their last point if the header is that of the first point" in text
+    assert "120.0 ms after it if a driver stamps the header at the end of the sweep" in text
+    assert "points: {from: end}" in text
+    assert "points: {from: start}" in text
+    for origin in ("start", "end"):
+        outcome = _run(shell, clouds, "--strict", rig=_rig(f"{{from: {origin}}}"))
+        assert outcome.code == 0, outcome.err
+
+
+@pytest.mark.parametrize("delay", [0, 400])
+def test_log_times_that_are_the_header_show_no_zero(shell: Shell, delay: int) -> None:
+    """Files whose log times are copies, some in whole microseconds."""
+    outcome = _run(shell, _bag(_clouds(OUSTER, NS), delay=delay), "--strict")
+    assert outcome.code == 0, outcome.err
+
+
+@pytest.mark.parametrize(("ahead", "offset_s"), [(100, "-0.100"), (37_000, "-37.000"), (15, "")])
+def test_headers_after_the_log_time_are_warned_about(
+    shell: Shell, ahead: int, offset_s: str
+) -> None:
+    clouds = _bag(_clouds(OUSTER, NS), delay=-ahead * MS)
+    outcome = _run(shell, clouds, rig=_rig("{from: start}"))
+    assert outcome.code == 0, outcome.err
+    found = [text for code, text in _warnings() if code == "cloud_time"]
+    assert len(found) == bool(offset_s)
+    if offset_s:
+        assert f"the header is {ahead}.0 ms later than the log time of every message" in found[0]
+        assert f"clock: {{offset_s: {offset_s}}}" in found[0]
+        rig = _rig("{from: start}") + f"    clock: {{offset_s: {offset_s}}}\n"
+        outcome = _run(shell, clouds, "--strict", rig=rig)
+        assert outcome.code == 0, outcome.err
+
+
+def test_absolute_times_after_the_log_time_are_warned_about(shell: Shell) -> None:
+    # The last point is at 97 ms.
+    outcome = _run(shell, _bag(_hesai(), delay=-3 * MS))
+    assert outcome.code == 0, outcome.err
+    assert "the last points are 100.0 ms later than the log time of every message" in outcome.err
+
+
+def test_times_below_half_of_the_spacing_are_warned_about(shell: Shell) -> None:
+    """9.7 ms of 100 ms; 50 % and more are usual, as of a lidar with a blind half."""
+    clouds = _bag(_clouds(OUSTER, [n * MS // 10 for n in range(COLUMNS)]))
+    outcome = _run(shell, clouds, "--strict")
+    assert outcome.code == 1
+    assert (
+        "field t (uint32): points span 9.700 ms in messages 100.000 ms apart, 10 %, as those of a "
+        "sector, of another field or of another unit: write points: {unit: ns} in the rig if that "
+        "is right" in outcome.err
+    )
+    outcome = _run(shell, clouds, "--strict", rig=_rig("{unit: ns}"))
+    assert outcome.code == 0, outcome.err
+    clouds = _bag(_clouds(OUSTER, [n * MS for n in range(51)]))
+    outcome = _run(shell, clouds, "--strict", rig=_rig("{from: start}"))
+    assert outcome.code == 0, outcome.err
 
 
 def test_absolute_times_can_be_stated(shell: Shell, tmp_path: Path) -> None:
@@ -707,9 +846,9 @@ def test_a_topic_without_times_is_an_error_unless_ignored(shell: Shell, tmp_path
     assert outcome.code == 1
     assert outcome.err == (
         "mlbatch: error: drive.db3: /map/points: expected the time of each point in a field t, "
-        "time, timestamp, time_stamp, timestamps, offset_time or ts, found x, y, z; name it in the "
-        "rig (points: {time: FIELD}), record the raw packets, or clouds with times, or leave the "
-        "topic out with --ignore /map/points\n"
+        "time, timestamp, time_stamp, timestamps, offset_time or ts, found x, y, z; none of them "
+        "rises within the scan as times do: record the raw packets, or clouds with times, or leave "
+        "the topic out with --ignore /map/points\n"
     )
     for option in ("--ignore /map/points", "--only one"):
         outcome = _run(shell, messages, f"--strict {option}")

@@ -231,8 +231,8 @@ MISTAKES: dict[str, tuple[bytes, str]] = {
     "no time": (
         cloud_message(OUSTER[:4], [(1, 2, 3, 9)]),
         "expected the time of each point in a field t, time, timestamp, time_stamp, timestamps, "
-        "offset_time or ts, found x, y, z, intensity; name it in the rig (points: {time: FIELD}), "
-        "record the raw packets, or clouds with times",
+        "offset_time or ts, found x, y, z, intensity; none of them rises within the scan as "
+        "times do: record the raw packets, or clouds with times",
     ),
     "no z": (
         cloud_message((*XYZ[:2], ("t", "uint32")), [(1, 2, 3)]),

@@ -108,7 +108,12 @@ class CloudTopics:
         return self._given(topic, frame) if known is None else known
 
     def _given(self, topic: str, frame: str) -> PointRule:
-        """What the rig says of a frame; RigError where two of its sensors differ."""
+        """How the rig says that the points of a frame are read."""
+        sensor = self._sensor(topic, frame)
+        return CONVENTION if sensor is None else sensor.points or CONVENTION
+
+    def _sensor(self, topic: str, frame: str) -> RigSensor | None:
+        """The sensor of the rig on a frame; RigError where the `points` of two differ."""
         found: RigSensor | None = None
         for sensor in self.rig:
             stream = sensor.stream
@@ -120,7 +125,14 @@ class CloudTopics:
                     f"come on {topic} as well, found others; give both the same"
                 )
             found = sensor
-        return CONVENTION if found is None else found.points or CONVENTION
+        return found
+
+    def _offset_ns(self, topic: str, frame: str) -> int | None:
+        """What the rig adds to the times of a lidar; None where it converts their epoch."""
+        sensor = self._sensor(topic, frame)
+        if sensor is None:
+            return 0
+        return sensor.offset_ns if sensor.epoch is None else None
 
     def _is_stated(self, topic: str) -> bool:
         """Return whether the rig says how the points of a topic are read."""
@@ -186,7 +198,8 @@ class CloudTopics:
             return
         try:
             for (frame, _), samples in examined.samples.items():
-                rule, texts = checked_rule(samples, self._given(name, frame), name)
+                offset_ns = self._offset_ns(name, frame)
+                rule, texts = checked_rule(samples, self._given(name, frame), name, offset_ns)
                 self.rules.setdefault((name, frame), rule)
                 self.ahead_ns.setdefault((name, frame), ahead_ns(samples, rule))
                 notes |= dict.fromkeys(texts)

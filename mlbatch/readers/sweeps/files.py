@@ -28,6 +28,8 @@ _SIZE = re.compile(r"[1-9]\d{0,4}", re.ASCII)
 _DIGITS = re.compile(r"\d{1,12}", re.ASCII)
 # sensor_msgs/PointField: number of a datatype.
 _NUMBERS = {"i1": 1, "u1": 2, "i2": 3, "u2": 4, "i4": 5, "u4": 6, "f4": 7, "f8": 8}
+# Whole numbers of 64 bits, as times since 1970; a PointField has none, so they become float64.
+_WIDE = ("i8", "u8")
 MOST_BYTES = 1 << 28
 
 
@@ -121,13 +123,13 @@ def _pcd(path: Path, data: bytes) -> _Points:
                 "the file is damaged"
             )
         text = f"{_PCD_KINDS.get(kind, '?')}{size}"
-        single = text in _NUMBERS and repeated == "1" and name != "_"
+        single = text in (*_NUMBERS, *_WIDE) and repeated == "1" and name != "_"
         fields.append((name, text if single else f"V{int(size) * int(repeated)}"))
     count = _count(path, head)
-    found, step = _offsets(fields)
+    found, step = _offsets([(name, "f8" if kind in _WIDE else kind) for name, kind in fields])
     kind = head["DATA"].split()[0] if head["DATA"].split() else ""
     if kind == "ascii":
-        return _Points(found, step, _ascii(path, body, fields, count))
+        return _Points(found, step, _as_floats(_ascii(path, body, fields, count), fields))
     if kind != "binary":
         raise SweepError(
             f"{path}: expected DATA binary or ascii, found {kind!r}; convert it with PCL: "
@@ -138,7 +140,23 @@ def _pcd(path: Path, data: bytes) -> _Points:
             f"{path}: expected {count} points of {step} bytes, found {len(body)} bytes of data; "
             "copy the file again"
         )
-    return _Points(found, step, body[: step * count])
+    return _Points(found, step, _as_floats(body[: step * count], fields))
+
+
+def _as_floats(data: bytes, fields: Sequence[tuple[str, str]]) -> bytes:
+    """Points with the whole numbers of 64 bits as float64, where they are."""
+    if not any(kind in _WIDE for _, kind in fields):
+        return data
+    before, after = (
+        np.dtype(
+            [(f"{at}", f"<{kind}" if kind[0] != "V" else kind) for at, kind in enumerate(kinds)]
+        )
+        for kinds in (
+            [kind for _, kind in fields],
+            ["f8" if kind in _WIDE else kind for _, kind in fields],
+        )
+    )
+    return np.frombuffer(data, before).astype(after).tobytes()
 
 
 def _pcd_head(path: Path, data: bytes) -> tuple[dict[str, str], bytes]:
