@@ -65,6 +65,10 @@ class ExportError(MlbatchError):
     """An output that cannot be written."""
 
 
+class DiskFullError(ExportError):
+    """A disk without space for an output that can be resumed; every other output fails there."""
+
+
 class Interrupted(MlbatchError):
     """An interrupted run that `--resume` can continue (exit code 130)."""
 

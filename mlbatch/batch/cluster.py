@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 from mlbatch.batch.driver import Result, failure
 from mlbatch.batch.task import Task, run_session
-from mlbatch.errors import ExportError, UsageError
+from mlbatch.errors import DiskFullError, ExportError, UsageError
 
 if TYPE_CHECKING:
     from distributed import Client
@@ -79,6 +79,8 @@ def _submitted(client: Client, task: Task) -> Any:
 def _result(task: Task, future: Any) -> Result:
     try:
         return Result(task.session.name, future.result(), ran=True)
+    except DiskFullError:
+        raise
     except Exception as err:
         # KilledWorker: workers died several times with this session.
         return failure(task, err)

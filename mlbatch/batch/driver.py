@@ -11,7 +11,7 @@ from queue import Empty, SimpleQueue
 
 from mlbatch.batch.record import FAILED, SessionRecord
 from mlbatch.batch.task import Stop, Task, finished, run_session
-from mlbatch.errors import Interrupted, MlbatchError, system_error
+from mlbatch.errors import DiskFullError, Interrupted, MlbatchError, system_error
 
 SKIPPED = "skipped"
 # Requests to a store at the same time.
@@ -56,7 +56,8 @@ class Batch:
     def run(self, tasks: Sequence[Task]) -> list[Result]:
         """Run what is missing or changed; the results in the order of the tasks.
 
-        With `fail_fast` sessions that were not begun have no result. Raises Interrupted.
+        With `fail_fast` sessions that were not begun have no result. Raises Interrupted, and
+        DiskFullError: then no other session is begun.
         """
         results: dict[str, Result] = {}
         left = []
@@ -75,6 +76,10 @@ class Batch:
             raise Interrupted(
                 f"interrupted; {len(results)} of {len(tasks)} sessions have ended; "
                 "the same command continues with the others"
+            ) from err
+        except DiskFullError as err:
+            raise DiskFullError(
+                f"{err} ({len(results)} of {len(tasks)} sessions have ended)"
             ) from err
         order = [task.session.name for task in tasks]
         return [results[name] for name in order if name in results]
@@ -125,7 +130,7 @@ def _by_threads(
     stop = Stop()
     closed = threading.Event()
     waiting: SimpleQueue[Task] = SimpleQueue()
-    results: SimpleQueue[Result | None] = SimpleQueue()
+    results: SimpleQueue[Result | DiskFullError | None] = SimpleQueue()
 
     def work() -> None:
         while not closed.is_set() and not waiting.empty():
@@ -133,7 +138,12 @@ def _by_threads(
                 task = waiting.get_nowait()
             except Empty:
                 break
-            result = result_of(task, stop)
+            try:
+                result = result_of(task, stop)
+            except DiskFullError as err:
+                closed.set()
+                results.put(err)
+                break
             if result is not None:
                 if fail_fast and result.failed:
                     closed.set()
@@ -153,6 +163,8 @@ def _by_threads(
             if result is None:
                 alive -= 1
                 continue
+            if isinstance(result, DiskFullError):
+                raise result
             yield result
     finally:
         if alive:
@@ -166,11 +178,13 @@ def _by_threads(
 
 
 def result_of(task: Task, stop: Stop) -> Result | None:
-    """Run a session; None if it was interrupted."""
+    """Run a session; None if it was interrupted. Raises DiskFullError, which ends the others."""
     try:
         return Result(task.session.name, run_session(task, stop), ran=True)
     except Interrupted:
         return None
+    except DiskFullError:
+        raise
     except Exception as err:
         # One session must not end the others.
         return failure(task, err)

@@ -6,6 +6,7 @@ The same function runs in a thread of the driver and in a Dask worker; all it ne
 from __future__ import annotations
 
 import contextlib
+import errno
 import fcntl
 import os
 import shutil
@@ -43,7 +44,7 @@ from mlbatch.batch.session import (
     own_files,
 )
 from mlbatch.bounded import parse_json, read_text
-from mlbatch.errors import ExportError, Interrupted, MlbatchError, one_line
+from mlbatch.errors import DiskFullError, ExportError, Interrupted, MlbatchError, one_line
 
 # Exit codes of `convert` that another attempt would not change, and that of a limit.
 _FINAL = (0, 1, 2, 3)
@@ -52,6 +53,9 @@ _MARK = "mlbatch: error: "
 _LIMIT_MARK = "mlbatch: limit exceeded: "
 # A process whose driver was killed ends within milliseconds; another driver's does not.
 _LOCK_S = 20.0
+# Reasons of errors about a full disk, and free space in which no output fits.
+_FULL = (os.strerror(errno.ENOSPC), os.strerror(errno.EDQUOT))
+_LEAST_FREE_BYTES = 1 << 20
 _POLL_S = 0.05
 
 
@@ -130,9 +134,38 @@ def _earlier(task: Task) -> SessionRecord | None:
 def run_session(task: Task, stop: Stop | None = None) -> SessionRecord:
     """Convert a session and write its session.json.
 
-    Raises Interrupted where `stop` ended it, ExportError where the folder cannot be used.
+    Raises Interrupted where `stop` ended it, ExportError where the folder cannot be used;
+    DiskFullError where it has no space: the session is unfinished, and can be resumed.
     """
-    stop = stop or Stop()
+    try:
+        return _run_session(task, stop or Stop())
+    except (MlbatchError, OSError) as err:
+        if isinstance(err, Interrupted) or not _is_full(task.folder, str(err)):
+            raise
+        raise _disk_full(task.folder) from err
+
+
+def _is_full(folder: Path, reason: str) -> bool:
+    """Whether a failure is that of a full disk; the log may have had no space for its reason."""
+    if any(one in reason for one in _FULL):
+        return True
+    try:
+        disk = os.statvfs(folder)
+    except OSError:
+        return False
+    free = disk.f_bavail if os.geteuid() else disk.f_bfree
+    # Some network file systems count no blocks.
+    return disk.f_blocks > 0 and free * disk.f_frsize < _LEAST_FREE_BYTES
+
+
+def _disk_full(folder: Path) -> DiskFullError:
+    return DiskFullError(
+        f"{folder}: expected space for its output, found a full disk; free space, and the same "
+        "command continues with this session and those that were not begun"
+    )
+
+
+def _run_session(task: Task, stop: Stop) -> SessionRecord:
     session = task.session
     began_s = time.monotonic()
     try:
@@ -152,11 +185,14 @@ def run_session(task: Task, stop: Stop | None = None) -> SessionRecord:
         with _staged(task) as local:
             code, attempts = _attempts(local, log, stop)
             _add_page(local, code, log, stop)
+        line = "" if code == 0 else _line(task.folder, code)
+        if code not in (0, _LIMIT) and _is_full(task.folder, line):
+            raise _disk_full(task.folder)
         record = SessionRecord(
             session.name,
             DONE if code == 0 else FAILED,
             code,
-            "" if code == 0 else _line(task.folder, code),
+            line,
             key | {CONTENT: content(session)},
             attempts=attempts,
             inputs=[*session.inputs],

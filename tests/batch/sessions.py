@@ -14,7 +14,8 @@ from tests.builders.run import ROOT
 from tests.builders.sessions import NS_PER_MS, SMALL, Unit, write_session
 
 # Imported by every Python process that has it on its path: the process of a session `crash*` ends
-# by SIGSEGV at once; that of a session `killed*` by SIGKILL at its first attempt, when it writes.
+# by SIGSEGV at once; that of a session `killed*` by SIGKILL at its first attempt, when it writes;
+# that of a session `full*` at its first attempt by the line of a full disk.
 SABOTEUR = """
 import os, signal, sys, threading, time
 words = getattr(sys, "orig_argv", [])
@@ -24,6 +25,12 @@ if "mlbatch.cli.child" in words:
     if name.startswith("crash"):
         os.kill(os.getpid(), signal.SIGSEGV)
     marker = os.path.join(os.environ["SABOTEUR_MARKS"], name)
+    if name.startswith("full") and not os.path.exists(marker):
+        open(marker, "w").close()
+        reason = os.strerror(28)
+        line = f"{target}: expected to write it, found {reason!r}; free space on this disk"
+        os.write(2, f"mlbatch: error: {line}\\n".encode())
+        os._exit(1)
     if name.startswith("killed") and not os.path.exists(marker):
         open(marker, "w").close()
         def kill():

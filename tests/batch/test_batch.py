@@ -92,6 +92,27 @@ def test_a_crash_and_a_kill_cost_no_other_session(data: Dataset, tmp_path: Path)
     assert {path: path.stat().st_mtime_ns for path in out.rglob("*")} == before
 
 
+@pytest.mark.parametrize("workers", ["1", "2"])
+def test_a_full_disk_ends_the_batch_in_one_line(tmp_path: Path, workers: str) -> None:
+    data = write_dataset(tmp_path / "data", ["a1", "full1", "z1", "z2", "z3"])
+    out = tmp_path / "out"
+    ended = run(data, out, "--workers", workers)
+    assert (ended.code, ended.out) == (1, "")
+    assert ended.err.startswith(
+        f"mlbatch: error: {out / 'full1'}: expected space for its output, found a full disk; free "
+        "space, and the same command continues with this session and those that were not begun ("
+    )
+    assert ended.err.count("\n") == 1
+    # A session that another worker had begun ends in order.
+    assert states(out) in ([{"a1": "done"}] if workers == "1" else [{"a1": "done"}, {}])
+    assert (out / "full1" / "started.json").exists()
+    assert not (out / "z3").exists()
+    assert command("batch-status", out).out.split("full1")[1].split()[0] == "unfinished"
+    ended = run(data, out, "--workers", workers)
+    assert ended.code == 0
+    assert states(out) == dict.fromkeys(["a1", "full1", "z1", "z2", "z3"], "done")
+
+
 def _any(out: Path, name: str) -> bool:
     return any(out.glob(f"*/{name}"))
 
