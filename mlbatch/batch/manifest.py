@@ -33,10 +33,29 @@ OptionKinds = Mapping[str, str]
 
 @dataclass(frozen=True, slots=True)
 class Common:
-    """What all sessions share, unless they have their own."""
+    """What all sessions share, unless they have their own.
+
+    rig: may have fields as names of sessions; rig_place: key of the manifest, "" of the command
+    line, which reads it itself.
+    """
 
     rig: str | None = None
     options: tuple[Option, ...] = ()
+    rig_place: str = ""
+
+    def rig_of(self, match: str) -> str | None:
+        """The rig of a session, by what its pattern matched or by its first recording."""
+        return None if self.rig is None else _named(self.rig, match)
+
+    def session(self, name: str, inputs: tuple[str, ...], match: str) -> Session:
+        """A session; UsageError where it has no rig."""
+        rig = self.rig_of(match)
+        if rig and self.rig_place and not is_url(rig) and not Path(rig).is_file():
+            raise UsageError(
+                f"{self.rig_place}: expected the rig of session {name}, found no file {rig}; "
+                "correct the path, which is relative to the manifest"
+            )
+        return Session(name, inputs, rig, self.options)
 
 
 def _nothing(text: str) -> None: ...
@@ -106,8 +125,11 @@ def _of_pattern(
             f"{where}: expected recordings or folders, found none for {pattern!r}; check the "
             "pattern"
         )
-    globs = _globs_of_sweeps(common.rig)
-    found = [(match, _inputs(match) or _folder_of_sweeps(match, globs)) for match in matches]
+    globs = {rig: _globs_of_sweeps(rig) for rig in {common.rig_of(match) for match in matches}}
+    found = [
+        (match, _inputs(match) or _folder_of_sweeps(match, globs[common.rig_of(match)]))
+        for match in matches
+    ]
     if not any(inputs for _, inputs in found):
         raise UsageError(
             f"{where}: expected recordings in what matches {pattern!r}, found none; check the "
@@ -116,7 +138,7 @@ def _of_pattern(
     for match, inputs in found:
         if inputs:
             name = check_name(_named(template, match), where)
-            yield Session(name, inputs, common.rig, common.options)
+            yield common.session(name, inputs, match)
 
 
 def _globs_of_sweeps(rig: str | None) -> tuple[str, ...]:
@@ -218,7 +240,6 @@ def _of_manifest(
     root = read_yaml(path).fields(_KEYS, ("schema", "sessions"))
     root["schema"].choice((SCHEMA,))
     options = _options(root.get("options"), kinds)
-    rig = _path(root["rig"]) if "rig" in root else None
     mine = {option.name.removeprefix("--"): option for option in given.options}
     nodes = root["sessions"].elements("sessions")
     if not nodes:
@@ -226,10 +247,11 @@ def _of_manifest(
     for node in nodes:
         entries = node.fields(_SESSION_KEYS)
         own = _options(entries.get("options"), kinds)
-        common = Common(
-            given.rig or (_path(entries["rig"]) if "rig" in entries else rig),
-            _joined(options, own, mine),
-        )
+        common = replace(given, options=_joined(options, own, mine))
+        rig = entries.get("rig", root.get("rig"))
+        if given.rig is None and rig is not None:
+            _check_fields(_text(rig), rig)
+            common = replace(common, rig=_path(rig), rig_place=rig.place)
         yield from _of_entry(node, entries, common, say)
 
 
@@ -245,15 +267,18 @@ def _of_entry(
         if not inputs:
             raise entries["inputs"].error("a list of recordings", "an empty one", "add one")
         text = _named("{stem}", inputs[0]) if name is None else _text(name)
-        yield Session(check_name(text, node.place), inputs, common.rig, common.options)
+        yield common.session(check_name(text, node.place), inputs, inputs[0])
         return
     template = "{stem}" if name is None else _text(name)
+    _check_fields(template, name or node)
+    yield from _of_pattern(_path(entries["glob"]), template, common, entries["glob"].place, say)
+
+
+def _check_fields(template: str, node: Node) -> None:
     for word in _FIELDS.findall(template):
         if word not in _TEMPLATE_WORDS:
             known = ", ".join(f"{{{one}}}" for one in _TEMPLATE_WORDS)
-            place = name or node
-            raise place.error(known, f"{{{word}}}", "use one of them")
-    yield from _of_pattern(_path(entries["glob"]), template, common, entries["glob"].place, say)
+            raise node.error(known, f"{{{word}}}", "use one of them")
 
 
 def _text(node: Node) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,9 +13,11 @@ from mlbatch.batch.task import Task, finished
 from mlbatch.errors import MlbatchError
 
 # Without a finished session: outputs of whole recordings took 0.51 to 7 times their bytes
-# (docs/performance.md), and two cores convert at least 50 MB of a recording in a second.
+# (docs/performance.md), and two cores convert at least 50 MB of a recording in a second. A session
+# costs a process, the probe of ten seconds and a page as well.
 USUAL_RATIO = 2.0
 USUAL_BYTES_PER_S = 50e6
+USUAL_START_S = 1.5
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,8 +38,10 @@ class Plan:
     sessions: tuple[PlannedSession, ...]
     ratio: float  # bytes of output for a byte of input
     bytes_per_s: float  # of input, by a worker
-    measured: int  # number of finished sessions that the two are from; 0: usual values
+    start_s: float  # of each session besides
+    measured: int  # number of finished sessions that these are from; 0: usual values
     workers: int
+    cores: int
 
     @property
     def to_run(self) -> tuple[PlannedSession, ...]:
@@ -55,8 +60,10 @@ class Plan:
 
     @property
     def hours(self) -> float:
-        """Time with all workers."""
-        return self.bytes_in / self.bytes_per_s / self.workers / 3600
+        """Time with all workers, as far as there are cores; of the longest session at least."""
+        each_s = [self.start_s + (one.bytes or 0) / self.bytes_per_s for one in self.to_run]
+        at_once = min(self.workers, self.cores)
+        return max(sum(each_s) / at_once, max(each_s, default=0.0)) / 3600
 
 
 def plan_of(tasks: Sequence[Task], workers: int, *, retry_failed: bool = False) -> Plan:
@@ -66,12 +73,15 @@ def plan_of(tasks: Sequence[Task], workers: int, *, retry_failed: bool = False) 
     kept = [one for one in done if one.input_bytes and one.wall_s]
     bytes_in = sum(one.input_bytes for one in kept)
     ratio = sum(one.output_bytes for one in kept) / bytes_in if kept else USUAL_RATIO
-    speed = bytes_in / sum(one.wall_s for one in kept) if kept else USUAL_BYTES_PER_S
+    # The fastest session began within its time.
+    start_s = min([USUAL_START_S, *(one.wall_s for one in kept)])
+    converting_s = sum(one.wall_s - start_s for one in kept)
+    speed = bytes_in / converting_s if converting_s > 0 else USUAL_BYTES_PER_S
     sessions = tuple(
         _planned(task, record, retry_failed=retry_failed)
         for task, record in zip(tasks, records, strict=True)
     )
-    return Plan(sessions, ratio, speed, len(kept), workers)
+    return Plan(sessions, ratio, speed, start_s, len(kept), workers, os.cpu_count() or 1)
 
 
 def _planned(task: Task, record: SessionRecord | None, *, retry_failed: bool) -> PlannedSession:

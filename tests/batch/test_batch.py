@@ -8,6 +8,7 @@ import os
 import shutil
 import signal
 import threading
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -16,6 +17,14 @@ import pytest
 from mlbatch.batch.cache import Cache
 from mlbatch.batch.driver import Batch
 from mlbatch.batch.manifest import Common, sessions_of
+from mlbatch.batch.plan import (
+    USUAL_BYTES_PER_S,
+    USUAL_RATIO,
+    USUAL_START_S,
+    Plan,
+    PlannedSession,
+    plan_of,
+)
 from mlbatch.batch.store import tasks_of
 from mlbatch.errors import Interrupted
 from tests.batch.sessions import (
@@ -312,6 +321,42 @@ def test_a_plan_writes_nothing(data: Dataset, tmp_path: Path) -> None:
     assert ended.table == dict.fromkeys(NAMES, "missing")
     assert ended.last.startswith("8 of 8 sessions to convert: ")
     assert "usual values" in ended.last
+
+
+def _plan(sizes: list[int], workers: int, cores: int = 16) -> Plan:
+    sessions = tuple(PlannedSession(str(n), "missing", 1, size) for n, size in enumerate(sizes))
+    return Plan(sessions, USUAL_RATIO, USUAL_BYTES_PER_S, USUAL_START_S, 0, workers, cores)
+
+
+@pytest.mark.parametrize(
+    ("sizes", "workers", "cores", "expected_s"),
+    [
+        # 1.5 s of start and 50 MB in a second: short recordings cost their processes.
+        ([3_750_000] * 40, 1, 16, 63.0),
+        ([3_750_000] * 40, 2, 16, 31.5),
+        ([3_750_000] * 40, 8, 2, 31.5),
+        # A session is converted by one worker.
+        ([5_000_000_000, 50_000_000], 4, 16, 101.5),
+    ],
+)
+def test_a_plan_counts_the_start_of_sessions(
+    sizes: list[int], workers: int, cores: int, expected_s: float
+) -> None:
+    assert _plan(sizes, workers, cores).hours * 3600 == pytest.approx(expected_s)
+
+
+def test_a_plan_of_finished_sessions_is_their_time(good: Dataset, tmp_path: Path) -> None:
+    """As many sessions of the same size again take as long again."""
+    out = tmp_path / "out"
+    assert run(good, out).code == 0
+    records = [json.loads(path.read_text()) for path in out.glob("*/session.json")]
+    sessions = sessions_of([str(good.manifest)], Common(), {"rate": "value"})
+    tasks = tasks_of(sessions, str(out), Cache.of(None, 1.0), retries=0, pages=True)
+    plan = plan_of(tasks, 1)
+    assert plan.measured == 4
+    again = replace(plan, sessions=tuple(replace(one, word="missing") for one in plan.sessions))
+    wall_s = sum(record["wall_s"] for record in records)
+    assert again.hours * 3600 == pytest.approx(wall_s, rel=0.05)
 
 
 def test_a_foreign_folder_is_not_touched(good: Dataset, tmp_path: Path) -> None:

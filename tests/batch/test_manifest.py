@@ -89,7 +89,25 @@ def test_a_session_may_name_its_inputs(tmp_path: Path) -> None:
     assert list(read(tmp_path, "sessions: [{inputs: [x/drive_7.pcap.zst]}]\n")) == ["drive_7"]
 
 
+def test_a_rig_is_that_of_the_folder(tmp_path: Path) -> None:
+    touch(tmp_path, "raw/d1/a.pcap", "raw/d1/rig.yaml", "raw/d2/b.pcap", "raw/d2/rig.yaml")
+    text = 'rig: "raw/{folder}/rig.yaml"\nsessions: [{glob: "raw/*/", name: "{folder}"}]\n'
+    found = read(tmp_path, text)
+    assert {name: one.rig for name, one in found.items()} == {
+        name: f"{tmp_path}/raw/{name}/rig.yaml" for name in ("d1", "d2")
+    }
+    text = 'sessions: [{name: b7, inputs: [raw/d2/b.pcap], rig: "raw/{folder}/rig.yaml"}]\n'
+    assert read(tmp_path, text)["b7"].rig == f"{tmp_path}/raw/d2/rig.yaml"
+    (tmp_path / "raw/d2/rig.yaml").unlink()
+    expected = f"the rig of session b7, found no file {tmp_path}/raw/d2/rig.yaml; correct"
+    with pytest.raises(UsageError, match=rf"sessions\[0\].rig: expected {expected}"):
+        read(tmp_path, text)
+    with pytest.raises(RigError, match=r"manifest.yaml:2: rig: expected .*, found \{dir\}"):
+        read(tmp_path, 'rig: "{dir}/r.yaml"\nsessions: [{glob: "raw/*/"}]\n')
+
+
 def test_nearer_options_replace_farther_ones(tmp_path: Path) -> None:
+    touch(tmp_path, "truck.yaml", "may.yaml")
     text = (
         "rig: truck.yaml\noptions: {rate: 10, split: true, metadata: [a.json, b.json]}\n"
         "sessions:\n  - {inputs: [a.pcap]}\n"
