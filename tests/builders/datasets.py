@@ -250,8 +250,8 @@ def utbm() -> None:
     """Two HDL-32E."""
     bag(
         "utbm_robocar_dataset_20180719.bag",
-        velodyne_scans("/velodyne_left/velodyne_packets", "HDL-32E", "ros1", "velodyne_left"),
-        velodyne_scans("/velodyne_right/velodyne_packets", "HDL-32E", "ros1", "velodyne_right"),
+        velodyne_scans("/hdl32e_left/velodyne_packets", "HDL-32E", "ros1", "velodyne_left"),
+        velodyne_scans("/hdl32e_right/velodyne_packets", "HDL-32E", "ros1", "velodyne_right"),
     )
 
 
@@ -314,7 +314,15 @@ def m3dgr() -> None:
 
 
 def geode() -> None:
-    """A bag a device, each with a lidar."""
+    """A bag a device, each with a lidar; a calibration whose keys come twice, without a head."""
+    opencv("cali/alpha_config.yaml", T_IMU_LiDAR=upright(0.0961, -0.1338, 0.3032))
+    path = Path("cali/alpha_config.yaml")
+    matrix = path.read_text().split("---\n")[1]
+    camera = (
+        'image_topic: "/imu/imu"\nmodel_type:   PINHOLE\ndistortion_parameters:\n   k1: -0.05\n'
+    )
+    noise = "gyro_std: 9.6690835928856730e-03\ngyro_std: 8.2887875865635737e-05\n"
+    path.write_text(f"# Left camera\n{camera}# Right camera\n{camera}{noise}{matrix}")
     bag("Urban_alpha.bag", clouds("/velodyne_points", VELODYNE, before_end_s, header_ns=LAST))
     bag("Urban_beta.bag", clouds("/ouster/points", OUSTER, after_start_ns))
 
@@ -354,6 +362,7 @@ def tiers() -> None:
         clouds("/os_cloud_nodee/points", OUSTER, after_start_ns, clock_ns=BEHIND_NS),
         clouds("/velodyne_points", VELODYNE, before_end_s, header_ns=LAST),
         customs("/avia/livox/lidar"),
+        customs("/livox/lidar"),
     )
 
 

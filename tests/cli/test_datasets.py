@@ -7,6 +7,7 @@ Expected by hand: each lidar measures (1, 0, 0) in its frame, a column each ms o
 from __future__ import annotations
 
 import json
+import math
 import re
 import shutil
 from collections.abc import Callable
@@ -49,6 +50,13 @@ def _after_a_quarter(x: float, y: float, z: float) -> Place:
     return x, y + 1, z
 
 
+def _turned(yaw: float, pitch: float, origin: Place) -> Place:
+    """(1, 0, 0) after pitch and yaw; roll does not move it."""
+    x = math.cos(yaw) * math.cos(pitch)
+    y = math.sin(yaw) * math.cos(pitch)
+    return origin[0] + x, origin[1] + y, origin[2] - math.sin(pitch)
+
+
 RAW = made.SCAN_PACKETS * made.SCANS
 CONVERTED = {
     # Kit (0.9, 0, 2); the top a quarter about z, optical centres above the mounting faces.
@@ -58,7 +66,7 @@ CONVERTED = {
     "SubT-MRS": Row(made.subt_mrs, {"velodyne_1": (1.0, 0.0, 0.0)}, RAW),
     "Ford AV": Row(made.ford_av, {
         colour: _after_a_quarter(*place) for colour, place in made.FORD.items()}, RAW),
-    "UTBM": Row(made.utbm, {"left": (1.0, 0.5, 1.9), "right": (1.0, -0.5, 1.9)}, RAW),
+    "UTBM": Row(made.utbm, {"left": (0.5, 1.4, 1.5), "right": (1.5, 1.4, 1.5)}, RAW),
     "NTU VIRAL": Row(made.ntu_viral, {
         "horizontal": (0.95, 0.0, 0.055), "vertical": _after_a_quarter(-0.55, 0.03, 0.05)}),
     "MCD": Row(made.mcd, {
@@ -69,13 +77,20 @@ CONVERTED = {
     "BotanicGarden": Row(made.botanic_garden, {
         "vlp16": _after_a_quarter(0.06, 0.01, 0.17), "livox": (0.07, 1.09, -0.01)}),
     "M3DGR": Row(made.m3dgr, {"avia": (1.1, 0.0, 0.3), "mid360": (1.0, 0.0, 0.5)}),
-    "GEODE": Row(made.geode, {"velodyne": (1.0, 0.0, 0.2), "ouster": (1.3, 0.0, 0.2)}),
+    # The first column of the Ouster's matrix, and its last.
+    "GEODE": Row(made.geode, {
+        "velodyne": (1.0961, -0.1338, 0.3032),
+        "ouster": (0.998409 - 0.037768, -0.05634 + 0.25853, -0.00218 - 0.389902)}),
     # Named by their topics. Without a base_link the body is the common ancestor, box_base.
     "GrandTour": Row(made.grand_tour, {
         "boxi": _after_a_quarter(0.1, 0.0, 0.3), "boxi_livox": (1.2, 0.0, 0.1)}),
+    # Rz(yaw) Ry(pitch) Rx(roll) (1, 0, 0) + t, by the radians of the dataset's README.
     "TIERS": Row(made.tiers, {
-        "os0": (0.5**0.5, -(0.5**0.5), 0.0), "os1": (-(0.5**0.5), 0.58 + 0.5**0.5, 0.0),
-        "velodyne": (-1.16, 0.17, 0.12), "avia": (0.94, 0.3, -0.12)}),
+        "os0": (0.5**0.5, 0.5**0.5, 0.0),
+        "os1": _turned(2.34826, 3.12619, (0.0100882, 0.581502, -0.0210581)),
+        "velodyne": _turned(3.07795, 3.09161, (-0.164831, 0.173188, 0.117624)),
+        "avia": _turned(0.00549421, 0.000246092, (-0.0608374, 0.29663, -0.122276)),
+        "horizon": _turned(3.12905, 3.14022, (0.00345477, 0.145195, -0.134907))}),
     # The left one at (-0.27, 0, -0.22) of the centre, which is 0.28 m above the IMU.
     "UrbanNav": Row(made.urban_nav, {
         "center": (1.0, 0.0, 0.28), "left": _after_a_quarter(-0.27, 0.0, 0.06),
@@ -117,6 +132,23 @@ def test_every_row_of_the_page_is_run() -> None:
     assert {rig.name for rig in RIGS.glob("*.yaml")} == {w for w in named if w.endswith(".yaml")}
 
 
+@pytest.mark.parametrize("rig", sorted(path.name for path in RIGS.glob("*.yaml")))
+def test_every_rig_says_where_its_topics_and_poses_are_from(rig: str) -> None:
+    text = (RIGS / rig).read_text(encoding="utf-8")
+    if "refused" in text.partition("\n")[0]:
+        return
+    for word in ("Topics", "Poses"):
+        assert re.search(rf"^# {word}: \S", text, re.MULTILINE), word
+
+
+def test_lidars_of_utbm_and_tiers_are_those_of_their_definitions() -> None:
+    """Namespaces of the launch file of UTBM; five clouds in the README of TIERS."""
+    assert "{topic: /hdl32e_left/velodyne_packets}" in (RIGS / "utbm.yaml").read_text()
+    topics = re.findall(r"topic: (\S+)\}", (RIGS / "tiers.yaml").read_text())
+    assert topics == ["/os_cloud_node/points", "/os_cloud_nodee/points", "/velodyne_points",
+                      "/avia/livox/lidar", "/livox/lidar"]  # fmt: skip
+
+
 def _run_recipe() -> None:
     """The block of the page."""
     (recipe,) = re.findall(r"^```python\n(.*?)^```$", PAGE, re.MULTILINE | re.DOTALL)
@@ -138,7 +170,7 @@ def test_rows_that_are_converted(shell: Shell, name: str) -> None:
     for number, sensor in enumerate(sensors):
         place = row.places[sensor["name"]]
         pose = np.array(sensor["extrinsics"]["body_from_sensor"])
-        np.testing.assert_allclose(pose @ (1, 0, 0, 1), (*place, 1), atol=1e-6)
+        np.testing.assert_allclose(pose @ (1, 0, 0, 1), (*place, 1), atol=2e-6)
         packets = sensor["packets"]
         columns = sensor["columns"]
         assert packets["read"] == packets["accepted"] == (row.packets or CLOUD_COLUMNS)
