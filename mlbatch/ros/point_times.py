@@ -450,9 +450,9 @@ def _against_log_times(
     if late_ns > _USUAL_DELAY_NS:
         return [
             f"field {name}: {what} {late_ns / NS_PER_MS:.1f} ms later than the log time of every "
-            "message, so the clock of the lidar is ahead of that of the recorder: write "
+            "message, so the clock of the lidar is ahead of the log times: write "
             f"clock: {{offset_s: {(offset_ns - late_ns) / NS_PER_S:.3f}}} in the rig if the "
-            "recorder is right"
+            "log times are right"
         ]
     if reading.is_absolute or is_stated:
         return []
