@@ -16,3 +16,5 @@ MAX_SPREAD_M = 1.0
 # Of a sensor from the body, in a calibration, and by any source: float32 resolves 1 mm there.
 MAX_POSE_M = 100.0
 MAX_TRANSLATION_M = 10_000.0
+# Of a sensor from the origin of a vehicle's body; millimetres that are read as metres are beyond.
+FAR_POSE_M = 20.0

@@ -18,6 +18,7 @@ import numpy as np
 from mlbatch.arrays import F64Array, I64Array
 from mlbatch.batching.windows import Window
 from mlbatch.errors import RigError
+from mlbatch.lidar.limits import FAR_POSE_M
 from mlbatch.motion.imu import STANDSTILL_NS, Integrator
 from mlbatch.motion.moves import PoseLine
 from mlbatch.motion.track import PoseTrack
@@ -171,6 +172,13 @@ class ImuPoses:
         return False
 
     def _use(self, key: int | str, body_from_imu: F64Array, name: str) -> bool:
+        away_m = float(np.linalg.norm(body_from_imu[:3, 3]))
+        if not away_m <= FAR_POSE_M:
+            raise RigError(
+                f"--deskew imu: {name}: expected it within {FAR_POSE_M:g} m of the body origin, "
+                f"found {away_m:g} m; give its static transform in metres, or a trajectory "
+                "(FILE.tum)"
+            )
         self._chosen = key
         self._waiting = {key: self._waiting[key]}
         self.name = name

@@ -18,11 +18,15 @@ from mlbatch.arrays import F64Array
 from mlbatch.errors import RigError
 from mlbatch.frames.transforms import compose, from_quaternion, from_rpy_deg, inverse, rigid
 from mlbatch.frames.tree import Edge, FrameTree, clean, some
+from mlbatch.lidar.limits import FAR_POSE_M
 from mlbatch.rig.yaml_tree import Node, read_foreign, read_foreign_blocks
 from mlbatch.units import RAD_PER_DEG
 
 BODY_FROM_SENSOR = "body_from_sensor"
 SENSOR_FROM_BODY = "sensor_from_body"
+M = "m"
+MM = "mm"
+_MM_PER_M = 1000.0
 # Autoware: `velodyne_top_base_link` is the mounting face; points are in `velodyne_top`.
 _HOUSING = "_base_link"
 _POSE_KEYS = ("x", "y", "z", "roll", "pitch", "yaw")
@@ -37,8 +41,8 @@ class ExtrinsicsFiles:
     """`extrinsics: {file: ...}` of a rig, before the body frame is known.
 
     files: in the order given; frame: of the sensor, "": the only one, or its serial number; parent:
-    "": the body frame of the rig; keys: of matrices; direction: of their product; sensor_in_frame:
-    (4, 4), m, None where the rig gives none.
+    "": the body frame of the rig; keys: of matrices; direction: of their product; unit: of their
+    translations, "": m if they are near; sensor_in_frame: (4, 4), m, None where the rig gives none.
     """
 
     node: Node
@@ -47,13 +51,14 @@ class ExtrinsicsFiles:
     parent: str = ""
     keys: tuple[str, ...] = ()
     direction: str = ""
+    unit: str = ""
     sensor_in_frame: F64Array | None = None
 
     def pose(self, body_frame: str, serial: str) -> F64Array:
         """Return (4, 4) body_from_sensor, m; RigError names file, key, expected and found."""
         roots = [_read(file, self.node, by_key=bool(self.keys)) for file in self.files]
         if self.keys:
-            found = _product(roots, self.keys, self.node)
+            found = _product(roots, self.keys, self.node, self.unit)
             found = inverse(found) if self.direction == SENSOR_FROM_BODY else found
         else:
             found = self._chain(roots, clean(self.parent or body_frame), serial)
@@ -275,8 +280,8 @@ def _quaternion(node: Node, origin: Sequence[float], xyzw: Sequence[float]) -> F
 _SHAPES = {(4, 4): "4 x 4", (3, 4): "3 x 4", (3, 3): "3 x 3", (3, 1): "3 x 1"}
 
 
-def _product(roots: Sequence[Node], keys: Sequence[str], rig: Node) -> F64Array:
-    """The product of matrices in the order of the keys."""
+def _product(roots: Sequence[Node], keys: Sequence[str], rig: Node, unit: str) -> F64Array:
+    """The product of matrices in the order of the keys, m."""
     product = np.eye(4)
     before = ""
     for key in keys:
@@ -294,6 +299,16 @@ def _product(roots: Sequence[Node], keys: Sequence[str], rig: Node) -> F64Array:
             matrix[:3, 3] = values[:, 0]
         else:
             matrix[: values.shape[0], : values.shape[1]] = values
+        away = float(np.linalg.norm(matrix[:3, 3]))
+        if not unit and not away <= FAR_POSE_M:
+            raise node.error(
+                f"a translation in metres, at most {FAR_POSE_M:g} m on a vehicle",
+                f"one of {away:g}",
+                f"write `matrix_unit: mm` beside `key` ({rig.place}) if the file has millimetres, "
+                "or `matrix_unit: m`",
+            )
+        if unit == MM:
+            matrix[:3, 3] /= _MM_PER_M
         try:
             product = compose(product, rigid(matrix))
         except RigError as err:

@@ -231,6 +231,7 @@ def _extrinsics_files(node: Node, fields: Mapping[str, Node]) -> ExtrinsicsFiles
         _PARENT.of(fields),
         keys,
         direction,
+        _MATRIX_UNIT.of(fields),
         _SENSOR_IN_FRAME.of(fields),
     )
 
@@ -437,6 +438,9 @@ _DIRECTION = Key(
     choice_form("body_from_sensor", "sensor_from_body"),
     "what the matrix maps",
 )
+_MATRIX_UNIT = Key(
+    "matrix_unit", _choice("m", "mm"), "", choice_form("m", "mm"), "unit of their translations"
+)
 # Keys of streams and extrinsics that need another one.
 _NEEDS = {
     "frame_id": "topic",
@@ -444,6 +448,7 @@ _NEEDS = {
     "parent": "file",
     "key": "direction",
     "direction": "file",
+    "matrix_unit": "key",
     "sensor_in_frame": "file",
     "dtype": "glob",
 }
@@ -471,6 +476,7 @@ _EXTRINSICS_KEYS = (
     _PARENT,
     _MATRIX_KEYS,
     _DIRECTION,
+    _MATRIX_UNIT,
     _SENSOR_IN_FRAME,
 )
 _EXTRINSICS_FORM: Form = {

@@ -11,6 +11,7 @@ import pytest
 
 import mlbatch
 from tests.builders.sessions import FIXTURE, REPOSITORY, Arrays, Shell, arrays, names, report_of
+from tests.builders.simulated import scenario_text
 
 CAPTURE = FIXTURE / "two_lidars.pcap"
 RIG = FIXTURE / "rig.yaml"
@@ -249,3 +250,18 @@ def test_an_imu_that_is_not_recorded_gives_no_poses(shell: Shell) -> None:
     assert done.code == 1
     assert "expected" in done.err
     assert not Path("out").exists()
+
+
+@pytest.mark.parametrize(("x", "is_refused"), [(188, True), (-0.188, False)])
+def test_an_imu_beyond_a_vehicle_is_refused(shell: Shell, x: float, is_refused: bool) -> None:
+    """Millimetres that were written as metres: every turn would move the body by its arm."""
+    more = f"imu: {{rate_hz: 200, extrinsics: {{translation_m: [{x}, 0, 1]}}}}\n"
+    sensors = "  - {name: top, model: VLP-16, extrinsics: {translation_m: [0, 0, 2]}}\n"
+    text = scenario_text(sensors, motion="", duration=1.3, more=more)
+    Path("scenario.yaml").write_text(text, encoding="utf-8")
+    assert shell("simulate scenario.yaml -o rec.mcap").code == 0
+    done = shell("convert rec.mcap --rig rec.rig.yaml -o out --deskew imu -q --keep-partial")
+    assert (done.code == 1) == is_refused, done.err
+    if is_refused:
+        assert done.err.startswith("mlbatch: error: --deskew imu: the IMU /imu/data: expected it ")
+        assert "within 20 m of the body origin, found 188.003 m; give its static" in done.err

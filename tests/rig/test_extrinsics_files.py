@@ -239,6 +239,29 @@ def test_a_mistake_elsewhere_in_the_file_does_not_matter(folder: Path) -> None:
     assert "found a mistake in YAML; " in str(caught.value)
 
 
+def test_millimetres_are_refused_unless_stated(folder: Path) -> None:
+    """As T_CamL_CamR of GEODE: 188 mm, which were 188 m."""
+    (folder / "mm.yaml").write_text(
+        "%YAML:1.0\n---\nT: !!opencv-matrix\n   rows: 4\n   cols: 4\n   dt: d\n   data: "
+        "[1, 0, 0, -188.276, 0, 1, 0, -1.343, 0, 0, 1, -1.381, 0, 0, 0, 1]\n"
+        "far: !!opencv-matrix {rows: 3, cols: 1, dt: d, data: [12, 16, 0]}\n"
+    )
+    text = "{file: mm.yaml, key: T, direction: body_from_sensor%s}"
+    with pytest.raises(RigError) as caught:
+        _pose(folder, text % "")
+    assert str(caught.value) == (
+        f"{folder / 'mm.yaml'}:3: T: expected a translation in metres, at most 20 m on a vehicle, "
+        f"found one of 188.286; write `matrix_unit: mm` beside `key` ({folder / 'rig.yaml'}:3: "
+        f"{X}) if the file has millimetres, or `matrix_unit: m`"
+    )
+    np.testing.assert_allclose(
+        _pose(folder, text % ", matrix_unit: mm")[:3, 3], [-0.188276, -0.001343, -0.001381]
+    )
+    assert _pose(folder, text % ", matrix_unit: m")[0, 3] == -188.276
+    # 20 m are near.
+    assert _pose(folder, (text % "").replace("key: T", "key: far"))[0, 3] == 12.0
+
+
 X = "sensors[0].extrinsics"
 MISTAKES = [
     ("{file: none.yaml}", ".file: expected an existing file, found none at"),

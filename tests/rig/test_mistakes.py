@@ -63,7 +63,7 @@ SENSOR_KEYS = (
 STREAM_KEYS = "source_ip, port, topic, serial, frame_id, lidar_id"
 X_KEYS = (
     "translation_m, rotation_rpy_deg, rotation_xyzw, matrix, frame, file, parent, key, direction, "
-    "sensor_in_frame"
+    "matrix_unit, sensor_in_frame"
 )
 NUMBER = "expected a finite number"
 PLAIN_NUMBER = "write a decimal number, without quotes or unit"
