@@ -304,7 +304,7 @@ def _product(roots: Sequence[Node], keys: Sequence[str], rig: Node, unit: str) -
             raise node.error(
                 f"a translation in metres, at most {FAR_POSE_M:g} m on a vehicle",
                 f"one of {away:g}",
-                f"write `matrix_unit: mm` beside `key` ({rig.place}) if the file has millimetres, "
+                f"write `matrix_unit: mm` next to `key` ({rig.place}) if the file has millimetres, "
                 "or `matrix_unit: m`",
             )
         if unit == MM:

@@ -251,7 +251,7 @@ def test_millimetres_are_refused_unless_stated(folder: Path) -> None:
         _pose(folder, text % "")
     assert str(caught.value) == (
         f"{folder / 'mm.yaml'}:3: T: expected a translation in metres, at most 20 m on a vehicle, "
-        f"found one of 188.286; write `matrix_unit: mm` beside `key` ({folder / 'rig.yaml'}:3: "
+        f"found one of 188.286; write `matrix_unit: mm` next to `key` ({folder / 'rig.yaml'}:3: "
         f"{X}) if the file has millimetres, or `matrix_unit: m`"
     )
     np.testing.assert_allclose(
