@@ -11,6 +11,7 @@ import fnmatch
 import importlib
 import os
 import re
+import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence
 from datetime import timedelta
@@ -242,6 +243,30 @@ def download(file: RemoteFile, target: Path) -> None:
             f"{file.url}: expected {file.size} bytes, found {at}; it changed meanwhile: try again"
         )
     partial.replace(target)
+
+
+@contextlib.contextmanager
+def local_output(name: str) -> Iterator[Path]:
+    """The path of an output; for a URL that of a copy, with report and table, removed afterwards.
+
+    RecordingError without one.
+    """
+    if "://" not in name:
+        yield Path(name)
+        return
+    url = name.rstrip("/")
+    # Before a request: it names the package that is missing.
+    _place(url)
+    folder = url.rpartition("/")[0]
+    files = listed(url)
+    if not files:
+        files = [head(url), *(one for one in listed(folder) if one.url.startswith(f"{url}."))]
+    with tempfile.TemporaryDirectory(prefix="mlbatch-") as place:
+        for file in files:
+            target = Path(place, file.url.removeprefix(f"{folder}/"))
+            target.parent.mkdir(parents=True, exist_ok=True)
+            download(file, target)
+        yield Path(place, url.rpartition("/")[2])
 
 
 def _range(obstore: Any, place: _Place, at: int, length: int) -> Callable[[], bytes]:

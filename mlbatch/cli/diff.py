@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
@@ -16,19 +15,24 @@ SHOWN = 20
 
 
 def diff(
-    a: Annotated[Path, typer.Argument(metavar="A", help="Output of convert, of any format.")],
-    b: Annotated[Path, typer.Argument(metavar="B", help="Output to compare with it.")],
+    a: Annotated[
+        str, typer.Argument(metavar="A", help="Output of convert, of any format, or its URL.")
+    ],
+    b: Annotated[str, typer.Argument(metavar="B", help="Output to compare with it.")],
     tolerance: Annotated[
         float, typer.Option(help="Of reals (coordinates and ranges in m, intensities).")
     ] = 0.0,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON, for programs.")] = False,
 ) -> None:
     """Compare two outputs: first differing scan, field and point, and by how much; exit 1."""
-    from mlbatch.digest.comparison import check_tolerance
+    from mlbatch.batch.remote import local_output
+    from mlbatch.digest.diff import check_tolerance
     from mlbatch.digest.diff import diff as compare
     from mlbatch.errors import RecordingError, one_line
 
-    found = compare(a, b, check_tolerance(tolerance))
+    check_tolerance(tolerance)
+    with local_output(a) as one, local_output(b) as other:
+        found = compare(one, other, tolerance)
     if as_json:
         typer.echo(json.dumps(_values(a, b, found), indent=1))
     else:
@@ -41,14 +45,14 @@ def diff(
         )
 
 
-def _values(a: Path, b: Path, found: OutputDiff) -> dict[str, object]:
+def _values(a: str, b: str, found: OutputDiff) -> dict[str, object]:
     """The differences as JSON."""
     from dataclasses import asdict
 
     return {
         "schema": "mlbatch.diff/1",
-        "a": str(a),
-        "b": str(b),
+        "a": a,
+        "b": b,
         "same": found.same,
         "compared": found.compared,
         "run": [{"where": one.where, "a": one.expected, "b": one.found} for one in found.run],

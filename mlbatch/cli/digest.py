@@ -16,7 +16,10 @@ SHOWN = 20
 
 def digest(
     output: Annotated[
-        Path, typer.Argument(help="Output of convert: folder of npz or PLY, .mcap, .bag, rosbag2.")
+        str,
+        typer.Argument(
+            help="Output of convert: folder of npz or PLY, .mcap, .bag, rosbag2; or its URL."
+        ),
     ],
     golden: Annotated[
         Path | None,
@@ -26,31 +29,21 @@ def digest(
         Path | None,
         typer.Option(help="Compare with this golden file; exit with 1 where OUTPUT differs."),
     ] = None,
-    tolerance: Annotated[
-        float | None,
-        typer.Option(
-            help="With --against: of reals (coordinates and ranges in m, intensities); 0: same "
-            "bytes. [default: 0.00005]"
-        ),
-    ] = None,
     overwrite: Annotated[
         bool, typer.Option("--overwrite", help="Replace an existing golden file.")
     ] = False,
 ) -> None:
     """Describe an output in a golden file for tests, or compare it with one."""
+    from mlbatch.batch.remote import local_output
     from mlbatch.digest import compare, golden_text, read_golden
     from mlbatch.digest import digest as describe
-    from mlbatch.digest.comparison import TOLERANCE, check_tolerance
     from mlbatch.errors import UsageError, one_line
 
     if against is None:
-        if tolerance is not None:
-            raise UsageError(
-                "--tolerance: expected --against with it, found none; give a golden file"
-            )
         if golden is not None:
             _check(golden, overwrite=overwrite)
-        text = golden_text(describe(output))
+        with local_output(output) as path:
+            text = golden_text(describe(path))
         if golden is None:
             typer.echo(text, nl=False)
             return
@@ -59,16 +52,19 @@ def digest(
         return
     if golden is not None:
         raise UsageError("-o: expected either -o or --against, found both; leave one of them out")
-    allowed = check_tolerance(TOLERANCE if tolerance is None else tolerance)
-    result = compare(read_golden(against), describe(output), allowed)
+    expected = read_golden(against)
+    with local_output(output) as path:
+        result = compare(expected, describe(path))
     for line in _lines(result):
         typer.echo(one_line(line))
     if not result.ok:
         from mlbatch.errors import RecordingError
 
+        version = expected.get("version", "an earlier version")
         raise RecordingError(
-            f"{output}: expected what {against} describes, found {len(result.differences)} "
-            "difference(s); see above, and write the golden file again if the change is intended"
+            f"{output}: expected what {against} (made by mlbatch {version}) describes, found "
+            f"{len(result.differences)} difference(s); see above, and write the golden file again "
+            "if the change is intended"
         )
     typer.echo(one_line(f"{output}: as described in {against}"))
 
@@ -78,10 +74,6 @@ def _lines(result: Comparison) -> list[str]:
     left = len(result.differences) - len(lines)
     if left:
         lines.append(f"and {left} more")
-    lines += [
-        f"{name}: other bytes in {count} scan(s), all figures within the tolerance"
-        for name, count in result.within.items()
-    ]
     return lines
 
 

@@ -1,7 +1,7 @@
 """Golden files for tests: `digest(output)` describes an output in a small JSON document.
 
-Grid, accounting and warnings are in it as they are; each array of a scan by a checksum, a few
-statistics and four points, so that a difference is found and explained without the scans.
+Grid, accounting and warnings are in it as they are; each array of a scan by a checksum, which finds
+every difference, and by a few statistics and four points, which explain it without the scans.
 """
 
 from __future__ import annotations
@@ -11,13 +11,12 @@ from os import PathLike
 from pathlib import Path
 from types import ModuleType
 
-from mlbatch.digest.comparison import TOLERANCE, Comparison, Difference, compare
+from mlbatch.digest.comparison import Comparison, Difference, compare
 from mlbatch.digest.golden import SCHEMA, golden_of, golden_text, read_golden
 from mlbatch.digest.values import Json
 
 __all__ = [
     "SCHEMA",
-    "TOLERANCE",
     "Comparison",
     "Difference",
     "compare",

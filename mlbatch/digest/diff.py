@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -13,6 +14,7 @@ from mlbatch.digest.comparison import Difference, scan_name, walk
 from mlbatch.digest.fields import Values, fields_of
 from mlbatch.digest.run import describe_run, run_files
 from mlbatch.digest.values import Json, values
+from mlbatch.errors import UsageError
 from mlbatch.outputs.read import read
 from mlbatch.outputs.scan import Scan
 
@@ -57,6 +59,12 @@ class OutputDiff:
     def first(self) -> FieldDifference | None:
         """The first field that differs in the first scan that differs."""
         return next(iter(self.fields.values()), None)
+
+
+def check_tolerance(tolerance: float) -> None:
+    """Refuse a `--tolerance` that is not a finite number from 0."""
+    if not 0 <= tolerance < math.inf:
+        raise UsageError(f"--tolerance: expected 0 or more, found {tolerance}; write 0.0001")
 
 
 def diff(a: Path, b: Path, tolerance: float = 0.0) -> OutputDiff:

@@ -6,6 +6,7 @@ import json
 from collections.abc import Iterator
 from pathlib import Path
 
+import mlbatch
 from mlbatch.bounded import parse_json, read_text
 from mlbatch.digest.fields import COLUMN_FIELDS, describe, fields_of
 from mlbatch.digest.run import describe_run, run_files
@@ -16,7 +17,9 @@ from mlbatch.outputs.run_files import RunFiles
 from mlbatch.outputs.scan import Scan
 from mlbatch.outputs.table import read_table
 
-SCHEMA = "mlbatch.digest/1"
+SCHEMA = "mlbatch.digest/2"
+# Schema 1 has no version; the rest is the same.
+_READ = (SCHEMA, "mlbatch.digest/1")
 _STAMPS = ("first_stamp_ns", "last_stamp_ns")
 
 
@@ -75,8 +78,9 @@ def _scan(scan: Scan, stamps: dict[tuple[int, int], dict[str, Json]]) -> dict[st
 
 
 def golden_text(golden: dict[str, Json]) -> str:
-    """A golden file: indented, and a line for each scan, so that changes are readable as text."""
-    head = {key: value for key, value in golden.items() if key != "scans"}
+    """A golden file: with the version that made it, and a line for each scan, for reviews."""
+    head = {"schema": golden["schema"], "version": mlbatch.__version__}
+    head |= {key: value for key, value in golden.items() if key != "scans"}
     text = json.dumps(head, indent=1, ensure_ascii=False, allow_nan=False)
     return text.removesuffix("\n}") + ',\n "scans": [\n' + ",\n".join(_lines(golden)) + "\n ]\n}\n"
 
@@ -98,7 +102,7 @@ def read_golden(path: Path) -> dict[str, Json]:
             "`mlbatch digest OUTPUT -o FILE`"
         ) from err
     schema = golden.get("schema") if isinstance(golden, dict) else None
-    if schema != SCHEMA or not isinstance(golden.get("scans"), list):
+    if schema not in _READ or not isinstance(golden.get("scans"), list):
         raise RecordingError(
             f"{path}: expected a golden file of the schema {SCHEMA}, found {schema!r}; write one "
             "with `mlbatch digest OUTPUT -o FILE`"

@@ -168,6 +168,27 @@ def test_convert_alone(cloud: Cloud, tmp_path: Path, monkeypatch: pytest.MonkeyP
     assert "--overwrite" in again.err
 
 
+@pytest.mark.parametrize("kind", ["scans.mcap", "scans"])
+def test_digests_of_outputs_on_the_server(kind: str, cloud: Cloud, tmp_path: Path) -> None:
+    capture = cloud.data.folder / "raw" / "a1" / "drive.pcap"
+    near = tmp_path / kind
+    words = (capture, "-o", near, "--rate", "20", "--split", "--quiet")
+    assert cloud.run("convert", *words).code == 0
+    # A folder with folders of sensors, or a file with report and table next to it.
+    for path in sorted(tmp_path.rglob("*")):
+        if path.is_file():
+            key = f"digest/{path.relative_to(tmp_path).as_posix()}"
+            cloud.client.upload_file(str(path), "data", key)
+    url = f"s3://data/digest/{kind}"
+    golden = cloud.run("digest", near)
+    assert golden.code == 0, golden.err
+    assert cloud.run("digest", url) == golden
+    (tmp_path / "golden.json").write_text(golden.out, encoding="utf-8")
+    against = cloud.run("digest", url, "--against", tmp_path / "golden.json")
+    assert (against.code, against.err) == (0, "")
+    assert cloud.run("diff", near, url).code == 0
+
+
 def test_shards_of_a_copied_recording(
     cloud: Cloud, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -211,6 +232,8 @@ def test_a_web_server(cloud: Cloud, tmp_path: Path, monkeypatch: pytest.MonkeyPa
         (("batch", "https://127.0.0.1:1/*.pcap", "-o", "out"), 2),
         (("convert", "nowhere://data/x.pcap", "-o", "x.mcap"), 2),
         (("batch-status", "s3://data/nothing"), 1),
+        (("digest", "s3://data/nothing"), 1),
+        (("diff", "s3://data/nothing", "s3://data/nothing"), 1),
     ],
 )
 def test_mistakes_are_one_line(words: tuple[str, ...], code: int, cloud: Cloud) -> None:

@@ -134,7 +134,6 @@ OPTIONS: dict[str, dict[str, str]] = {
     "digest": {
         "--output": "golden.*JSON",
         "--against": "golden.*exit.*1",
-        "--tolerance": r"\bm\b.*bytes",
         "--overwrite": "existing",
     },
     "diff": {"--tolerance": r"\bm\b", "--json": "JSON"},

@@ -28,7 +28,7 @@ def change(path: Path, **values: Callable[[Array], Array]) -> None:
     np.savez(path, **arrays)
 
 
-def at(place: Any, amount: float) -> Callable[[Array], Array]:
+def at(place: Any, amount: Any) -> Callable[[Array], Array]:
     """An edit that adds to one value."""
 
     def edit(array: Array) -> Array:
@@ -86,6 +86,29 @@ def test_the_first_difference_and_the_largest(tmp_path: Path) -> None:
     assert ring.b - ring.a == 3
     # Of integers there is no tolerance.
     assert list(diff(a, b, tolerance=3).fields) == ["ring"]
+
+
+@pytest.mark.parametrize(("tolerance", "is_found"), [(0.4, True), (0.6, False)])
+def test_a_tolerance_holds_for_each_point(tolerance: float, is_found: bool, tmp_path: Path) -> None:
+    """A point moved by 0.5 m, and a pair whose sum is 0."""
+    a = convert(tmp_path / "a", "npz")
+    b = tmp_path / "b"
+    shutil.copytree(a, b)
+    change(b / "000002.npz", xyz=at((5000, 2), 0.5))
+    change(b / "000004.npz", xyz=at((slice(6000, 6002), 2), np.array([0.5, -0.5], np.float32)))
+    words = ("diff", a, b, "--tolerance", str(tolerance))
+    assert command(*words).code == int(is_found)
+    found = diff(a, b, tolerance)
+    assert {name: one.values for name, one in found.fields.items()} == (
+        {"xyz": 3} if is_found else {}
+    )
+
+
+@pytest.mark.parametrize("tolerance", ["-1", "nan", "inf"])
+def test_a_tolerance_is_a_number_from_0(tolerance: str, tmp_path: Path) -> None:
+    found = command("diff", tmp_path, tmp_path, "--tolerance", tolerance)
+    assert (found.code, len(found.err.splitlines())) == (2, 1)
+    assert "--tolerance: expected 0 or more" in found.err
 
 
 def test_stamps_are_compared_to_the_nanosecond(tmp_path: Path) -> None:
