@@ -127,7 +127,7 @@ def _run_one(job: Job, target: Target) -> list[str]:
         if target.resume and _is_complete(output, overwrite=target.overwrite):
             return _beyond_limits_before(target, name)
         resume_log = _resume_log(job, output, name, options, resumes=target.resume)
-        options = options._replace(kept_bytes=resume_log.kept_bytes)
+        options = options._replace(kept_bytes=resume_log.kept_bytes, kept_crc=resume_log.kept_crc)
         if options.kept_bytes is None:
             check_target(name, output, options, job.layout)
             if warning := preflight.check_disk(job, output):

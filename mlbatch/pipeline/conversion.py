@@ -366,12 +366,12 @@ class Conversion:
 
     # -- accounting ---------------------------------------------------------------------------
 
-    def account(self, scan: Scan) -> None:
-        """Count a scan that is written; call in the order of the scans."""
+    def account(self, scan: Scan, checksum: int | None = None) -> None:
+        """Count a scan that is written, see `ScanJob`; call in the order of the scans."""
         for sensor, count in zip(self.sensors, scan.columns_per_sensor, strict=True):
             sensor.ledger.columns.written += count
         if self.table is not None:
-            self.table.add(scan)
+            self.table.add(scan, checksum)
 
     def points(self, sensor: int) -> PointCounts:
         """Point counters of a sensor so far."""

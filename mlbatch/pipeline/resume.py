@@ -144,6 +144,11 @@ class ResumeLog:
         return None if self._state is None else self._state.kept_bytes
 
     @property
+    def kept_crc(self) -> int:
+        """CRC-32 of these bytes."""
+        return 0 if self._state is None else self._state.kept_crc
+
+    @property
     def identity(self) -> dict[str, str]:
         """Identity of the job and, once it runs, of its inputs."""
         return self._identity
@@ -181,8 +186,10 @@ class ResumeLog:
         self._file = StateFile(state_path(self._target), state, is_new=is_new)
         self._due_s = time.monotonic() + INTERVAL_S
 
-    def take(self, before: Sequence[ImuSamples | Message], task: DecodeTask | None) -> bool:
-        """Add what is written next; True if it is a scan that the `.partial` already contains.
+    def take(
+        self, before: Sequence[ImuSamples | Message], task: DecodeTask | None
+    ) -> FinishedScan | None:
+        """Add what is written next; returns the scan if the `.partial` already contains it.
 
         before: what is forwarded before the scan; task: of the scan, None without one. UsageError
         if the scan of the interrupted run was made from something else.
@@ -190,27 +197,28 @@ class ResumeLog:
         for item in before:
             self._content = _forwarded_content(item, self._content)
         if task is None or self._run is None:
-            return False
+            return None
         self._content = self._run.pool.content(task, self._content)
         self._taken += 1
         if self._state is None or self._taken > self.done:
             self._contents.append(self._content)
-            return False
-        if self._content != self._state.scans[self._taken - 1].content:
+            return None
+        kept = self._state.scans[self._taken - 1]
+        if self._content != kept.content:
             raise UsageError(
                 f"{partial_path(self._target)}: expected the packets of the interrupted run, found "
                 f"others for scan {self._taken} of {self.done} that are finished: a recording was "
                 "changed; restore it, or leave out --resume to start over"
             )
-        return True
+        return kept
 
-    def note(self, outcomes: Outcomes, writer: ScanWriter) -> None:
+    def note(self, outcomes: Outcomes, checksum: int | None, writer: ScanWriter) -> None:
         """Note a scan that was written or skipped; call in the order of the scans."""
         self._given += 1
         if self._given <= self.done:
             return
         self._finished.append(
-            FinishedScan(self._contents.popleft(), [list(counts) for counts in outcomes])
+            FinishedScan(self._contents.popleft(), [list(counts) for counts in outcomes], checksum)
         )
         if time.monotonic() >= self._due_s:
             self._record(writer)
@@ -223,7 +231,7 @@ class ResumeLog:
         fresh = scans - self.recorded
         if fresh > 0 and self._file is not None:
             finished = [self._finished.popleft() for _ in range(fresh)]
-            self._file.add(finished, checkpoint.kept_bytes)
+            self._file.add(finished, checkpoint.kept_bytes, checkpoint.kept_crc)
             self.recorded = scans
 
     def complete(self) -> None:

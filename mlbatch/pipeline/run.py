@@ -128,7 +128,7 @@ class _Output:
     ) -> ScanTask:
         """following: of the scan that the messages precede, None if it is left out."""
         self._begin()
-        is_kept = self._resume_log is not None and self._resume_log.take(before, task)
+        kept = None if self._resume_log is None else self._resume_log.take(before, task)
         return ScanTask(
             self._run,
             task,
@@ -136,7 +136,7 @@ class _Output:
             self.writer,
             self._idle,
             self._resume_log,
-            is_kept=is_kept,
+            kept=kept,
             index=None if following is None else following.label.index,
         )
 

@@ -13,6 +13,7 @@ from mlbatch.writers import ScanJob, ScanWriter
 
 if TYPE_CHECKING:
     from mlbatch.pipeline.resume import ResumeLog
+    from mlbatch.pipeline.state_file import FinishedScan
 
 
 class ScanTask:
@@ -27,13 +28,13 @@ class ScanTask:
         idle: list[DecodeWorker],
         resume_log: ResumeLog | None,
         *,
-        is_kept: bool,
+        kept: FinishedScan | None,
         index: int | None,
     ) -> None:
         """task: None where messages are to be written without a scan; before: what to write first.
 
         writer: None in a dry run; idle: decode workers, of which one is taken while in use;
-        is_kept: a resumed output already contains the scan; index: of its window, None where no
+        kept: the scan, if a resumed output already contains it; index: of its window, None where no
         scan follows the messages.
         """
         self._run = run
@@ -42,7 +43,7 @@ class ScanTask:
         self._writer = writer
         self._idle = idle
         self._resume_log = resume_log
-        self._is_kept = is_kept
+        self._kept = kept
         self._index = index
         self._worker: DecodeWorker | None = None
         self._decoded: Decoded | None = None
@@ -65,12 +66,14 @@ class ScanTask:
             self.decode_with(self._worker)
         if self._writer is not None:
             self._job = self._writer_job(self._writer)
+            if self._kept is not None:
+                self._job.checksum = self._kept.checksum
             self._timed(self._job.pack)
 
     def append(self) -> None:
         """Count the scan, write what precedes it, reserve its place in the output. In order."""
         if self._decoded is not None:
-            self._run.account(self._decoded.scan)
+            self._run.account(self._decoded.scan, self._job.checksum)
         if self._index is not None:
             self._job.start(self._index)
         for item in self._before:
@@ -85,7 +88,7 @@ class ScanTask:
         """Write what is complete; note it for `--resume`. In order."""
         self._timed(self._job.commit)
         if self._decoded is not None and self._resume_log is not None and self._writer is not None:
-            self._resume_log.note(self._decoded.outcomes, self._writer)
+            self._resume_log.note(self._decoded.outcomes, self._job.checksum, self._writer)
         self._run.stages.write_s += self._write_s
         self._run.stages.decode_s += self._decode_s
         if self._worker is not None:
@@ -95,7 +98,7 @@ class ScanTask:
     def _writer_job(self, writer: ScanWriter) -> ScanJob:
         if self._task is None or self._decoded is None:
             return writer.flush()
-        write = writer.skip if self._is_kept else writer.write
+        write = writer.write if self._kept is None else writer.skip
         return write(self._decoded.scan, self._task.only)
 
     def _timed(self, stage: Callable[[], None]) -> None:

@@ -46,7 +46,7 @@ from mlbatch.writers import (
     open_writer,
     write_text,
 )
-from mlbatch.writers.scan_folder import FolderWriter
+from mlbatch.writers.scan_folder import FolderWriter, checksum_of
 
 _KB_PER_MB = 1024
 
@@ -175,7 +175,7 @@ def merge(
             _take_bag(parts, writer)
         table = ScanTable(account.info, account.columns_per_s)
         for _, figures in _merged_scans(parts):
-            table.add(figures.scan(account.info))
+            table.add(figures.scan(account.info), figures.checksum)
         report = _merged_report(parts, table, command)
         broken = imbalances(report) or _unequal_points(report)
         if broken:
@@ -231,9 +231,12 @@ def _take_scans(parts: Sequence[Part], writer: FolderWriter) -> None:
     info = parts[0].account.info
     for owner, figures in _merged_scans(parts):
         scan = figures.scan(info)
+        sources: list[Path] = []
         for path in writer.files(scan, figures.only).values():
             name = path.relative_to(writer.folder)
-            _take(owner.folder / name, owner.account.files.get(name.as_posix()), path)
+            sources.append(owner.folder / name)
+            _take(sources[-1], owner.account.files.get(name.as_posix()), path)
+        _check_bytes(sources, figures.checksum)
         writer.skip(scan, figures.only).commit()
 
 
@@ -246,18 +249,19 @@ def _take_bag(parts: Sequence[Part], writer: ScanWriter) -> None:
     if not isinstance(writer, BagWriter):
         raise UsageError(f"{account.format}: expected a format with several files, found another")
     owners = [
-        (number_of_file(name), part.folder / name, size)
+        (number_of_file(name), part.folder / name, size, part.account.checksums.get(name))
         for part in parts
         for name, size in part.account.files.items()
     ]
-    numbers = sorted(-1 if number is None else number for number, _, _ in owners)
+    numbers = sorted(-1 if number is None else number for number, *_ in owners)
     if numbers != list(range(account.bag_files)):
         raise RecordingError(
             f"expected the {account.bag_files} files of the bag in {len(parts)} shards, found "
             f"{len(numbers)}; convert all shards again"
         )
-    for number, source, size in owners:
+    for number, source, size, checksum in owners:
         _take(source, size, writer.path_of_file(number or 0))
+        _check_bytes([source], checksum)
         # An error names the part, not the output.
         read_file(source)
     writer.adopt_files(account.bag_files)
@@ -283,6 +287,15 @@ def _take(source: Path, size: int | None, path: Path) -> None:
             os.link(source.resolve(), path)
             return
         shutil.copyfile(source, path)
+
+
+def _check_bytes(sources: Sequence[Path], checksum: int | None) -> None:
+    """Compare files of a part with their checksum."""
+    if checksum_of(sources) != checksum:
+        raise RecordingError(
+            f"{sources[0]}: expected the bytes that the shard has written, found others; copy the "
+            "part again, or convert this shard again with --overwrite"
+        )
 
 
 # -- the report -------------------------------------------------------------------------------

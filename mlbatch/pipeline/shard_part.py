@@ -38,7 +38,7 @@ from mlbatch.writers import (
     write_text,
 )
 
-SCHEMA = "mlbatch.shard/2"
+SCHEMA = "mlbatch.shard/3"
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,7 +46,7 @@ class ShardScan:
     """A scan of a shard; the fields are those of `Scan`, but these.
 
     number: among all scans of the recording; only: with `--split` the index of its sensor;
-    stamps_ns: of the first and the last column, none without a column.
+    stamps_ns: of the first and the last column, none without a column; checksum: see `ScanJob`.
     """
 
     number: int
@@ -65,6 +65,7 @@ class ShardScan:
     overlap: tuple[float, ...]
     fill: tuple[float, ...]
     is_partial: bool
+    checksum: int | None = None
 
     def scan(self, info: RunInfo) -> Scan:
         """The scan without its points."""
@@ -130,7 +131,7 @@ class Account:
     max_bag_s: as of `Job`; notes_before_points: warnings of the report that precede those about
     points; total: number of scans of all shards; bag_files: of the files of a bag, 0 where scans
     have files of their own; figures: digest of all scans, without points; scans: of this shard;
-    files: of this shard, bytes by path in the folder.
+    files: of this shard, bytes by path in the folder; checksums: CRC-32 of files of several scans.
     """
 
     shard: Shard
@@ -150,11 +151,12 @@ class Account:
     figures: str
     scans: tuple[ShardScan, ...]
     files: dict[str, int]
+    checksums: dict[str, int]
 
     def shared(self) -> dict[str, Any]:
         """What must be the same in the accounts of all shards, as JSON values."""
         found = _fields(to_json(replace(self, scans=())))
-        for name in ("shard", "scans", "files"):
+        for name in ("shard", "scans", "files", "checksums"):
             del found[name]
         report = found["report"]
         for name in ("timing", "command"):
@@ -194,7 +196,7 @@ class ShardWriter:
         """Whether a scan is of this shard."""
         return self.shard.has(scan.index, scan.slice, scan.slices)
 
-    def note(self, scan: Scan, sensor: int | None) -> None:
+    def note(self, scan: Scan, sensor: int | None, checksum: int | None) -> None:
         """Note the next scan, of any shard."""
         figures = _figures(scan, self.total, sensor)
         # Points of other shards are unknown.
@@ -202,7 +204,7 @@ class ShardWriter:
         self._digest.update(json.dumps(known).encode())
         self.total += 1
         if self.has(scan):
-            self.scans.append(figures)
+            self.scans.append(replace(figures, checksum=checksum))
 
     def write(self, scan: Scan, sensor: int | None = None) -> ScanJob:
         """Return the job that writes a scan, or only notes another shard's."""
@@ -251,13 +253,15 @@ class _NotedJob(ScanJob):
         self._job = start(scan, sensor) if is_own else writer.inner.pass_over(scan)
 
     def pack(self) -> None:
+        self._job.checksum = self.checksum
         self._job.pack()
+        self.checksum = self._job.checksum
 
     def start(self, index: int) -> None:
         self._job.start(index)
 
     def append(self) -> None:
-        self._writer.note(self._scan, self._sensor)
+        self._writer.note(self._scan, self._sensor, self.checksum)
         self._job.append()
 
     def compress(self) -> None:
@@ -335,6 +339,7 @@ class ShardOutput:
             figures=writer.figures,
             scans=tuple(writer.scans),
             files=_sizes(folder),
+            checksums=writer.inner.checksums,
         )
         head = {"schema": SCHEMA, "version": mlbatch.__version__}
         text = json.dumps(head | _fields(to_json(self.account)), separators=(",", ":"))

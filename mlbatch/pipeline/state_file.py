@@ -24,7 +24,7 @@ from typing import NamedTuple, TypeAlias
 from mlbatch.errors import ExportError
 from mlbatch.writers import export_errors, partial_path, sync_entries, sync_to_disk
 
-SCHEMA = "mlbatch.state/2"
+SCHEMA = "mlbatch.state/3"
 _BOOT = Path("/proc/sys/kernel/random/boot_id")
 _CHECKSUM_DIGITS = 16
 
@@ -35,11 +35,13 @@ class FinishedScan(NamedTuple):
     """A scan that the `.partial` contains.
 
     content: checksum of what was read for it and before it, see `ResumeLog.take`;
-    outcomes: slots by outcome, one list a sensor; see `ledger.POINT_COUNTERS`.
+    outcomes: slots by outcome, one list a sensor; see `ledger.POINT_COUNTERS`; checksum: of the
+    scan as written, see `ScanJob`.
     """
 
     content: int
     outcomes: list[list[int]]
+    checksum: int | None
 
 
 @dataclass(slots=True)
@@ -50,6 +52,7 @@ class State:
     segment: str  # of the session, as text
     scans: list[FinishedScan] = field(default_factory=list)
     kept_bytes: int = 0  # of the output's file, with these scans
+    kept_crc: int = 0  # CRC-32 of these bytes
     length: int = 0  # bytes of the records that count
     checksum: str = ""  # of the last of them
 
@@ -99,9 +102,9 @@ class StateFile:
             boot |= {"schema": SCHEMA, "part": state.segment, "identity": state.identity}
         self._append(boot)
 
-    def add(self, scans: list[FinishedScan], kept_bytes: int) -> None:
+    def add(self, scans: list[FinishedScan], kept_bytes: int, kept_crc: int) -> None:
         """Add scans that are safe within the first `kept_bytes` of the output's file."""
-        self._append({"kept_bytes": kept_bytes, "scans": scans})
+        self._append({"kept_bytes": kept_bytes, "kept_crc": kept_crc, "scans": scans})
 
     def sync(self, partial: Path) -> None:
         """Force the output under construction and the state to the disk, as far as possible."""
@@ -168,6 +171,7 @@ class _Reading:
         self._state: State | None = None
         self._scans: list[FinishedScan] = []
         self._kept_bytes = 0
+        self._kept_crc = 0
         self._counting = 0  # scans that count
         self._now = _boot()
         self._boot = ""
@@ -185,12 +189,14 @@ class _Reading:
         state = self._state or _head(record)
         if "scans" in record:
             self._kept_bytes = _size(record.get("kept_bytes"), self._kept_bytes)
+            self._kept_crc = _size(record.get("kept_crc"), 0)
             self._scans += _scans(record["scans"])
         self._state = state
         self._boot = str(record.get("boot", self._boot))
         if self._boot == self._now or "synced" in record:
             self._counting = len(self._scans)
             state.kept_bytes = self._kept_bytes
+            state.kept_crc = self._kept_crc
             state.length = line.end
             state.checksum = line.checksum
         self.records += 1
@@ -244,7 +250,7 @@ def _head(record: Record) -> State:
 def _scans(found: object) -> list[FinishedScan]:
     if not isinstance(found, list):
         raise ValueError("no list of scans")
-    return [FinishedScan(int(content), outcomes) for content, outcomes in found]
+    return [FinishedScan(int(content), *rest) for content, *rest in found]
 
 
 def _size(found: object, at_least: int) -> int:

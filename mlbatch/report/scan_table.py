@@ -21,6 +21,9 @@ from mlbatch.units import NS_PER_MS, NS_PER_S
 
 # A number in every reader of CSV: a column of empty cells would be one of texts.
 UNKNOWN = "NaN"
+# In the column `checksum`: of a writer that gives none.
+NO_CHECKSUM = -1
+_CHECKSUMS = 1 << 32
 # A scan with less of any sensor's columns is underfilled.
 UNDERFILLED = 0.5
 # scans.csv is kept in memory up to this size, then in a temporary file.
@@ -91,13 +94,13 @@ class ScanTable:
         header = io.StringIO()
         # Names may need quotes; the cells of rows are numbers.
         writer = csv.writer(header, lineterminator="\n")
-        writer.writerow([*start, *counts, *gaps, *shares, "ready_host_ns"])
+        writer.writerow([*start, *counts, *gaps, *shares, "checksum", "ready_host_ns"])
         self._append(header.getvalue())
         self._columns_per_s = tuple(columns_per_s) or (None,) * len(names)
 
-    def add(self, scan: Scan) -> None:
-        """Add a written scan."""
-        row = _Row.of(scan)
+    def add(self, scan: Scan, checksum: int | None = None) -> None:
+        """Add a written scan; checksum: see `writers.ScanJob`."""
+        row = _Row.of(scan, checksum)
         if self.first_start_ns is None:
             self.first_start_ns = scan.start_ns
         self._empty_clouds += not scan.points
@@ -174,7 +177,7 @@ class ScanTable:
             *(row.coverage, row.overlap, row.columns, self._columns_per_s, length_ns, row.fill)
         )
         counts = _count_cells(row.columns, row.complete)
-        return f"{row.places()},{counts},{row.gaps()},{shares},{row.ready_host_ns}\n"
+        return f"{row.places()},{counts},{row.gaps()},{shares},{row.checksum},{row.ready_host_ns}\n"
 
     def _add_totals(self, row: _Row) -> None:
         if row.is_partial:
@@ -239,9 +242,10 @@ class _Row(NamedTuple):
     fill: tuple[float, ...]
     points_of: tuple[int, ...]
     is_partial: bool
+    checksum: int
 
     @classmethod
-    def of(cls, scan: Scan) -> _Row:
+    def of(cls, scan: Scan, checksum: int | None) -> _Row:
         """The row of one scan."""
         stamps = scan.column_stamp_ns
         nothing = (0.0,) * len(scan.columns_per_sensor)
@@ -261,6 +265,7 @@ class _Row(NamedTuple):
             tuple(scan.fill.tolist()) or (math.nan,) * len(nothing),
             scan.points_per_sensor,
             scan.is_partial,
+            NO_CHECKSUM if checksum is None else checksum,
         )
 
     def joined(self, other: _Row) -> _Row:
@@ -281,6 +286,10 @@ class _Row(NamedTuple):
             self.fill,
             tuple(a + b for a, b in zip(self.points_of, other.points_of, strict=True)),
             self.is_partial,
+            # A sum, as readers may have the scans of a window in another order.
+            NO_CHECKSUM
+            if NO_CHECKSUM in (self.checksum, other.checksum)
+            else (self.checksum + other.checksum) % _CHECKSUMS,
         )
 
     def places(self) -> str:

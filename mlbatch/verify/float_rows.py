@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from mlbatch.arrays import BoolArray, F32Array, F64Array, I64Array
-from mlbatch.bounded import MOST_TABLE_BYTES, read_bytes, read_text
+from mlbatch.bounded import read_text
 from mlbatch.verify.folders import ScanFile, readable, scan_files
 from mlbatch.verify.report_checks import RunMetadata
 from mlbatch.verify.scan import StoredScan
@@ -64,10 +64,7 @@ def read_rows(file: ScanFile) -> FloatRows:
         return FloatRows(_rows(file.read(), 4))
     rows = _rows(file.read(), 5)
     path = file.path.with_name(file.path.name.removesuffix(NUSCENES_SUFFIX) + TIME_SUFFIX)
-    try:
-        times = _rows(read_bytes(path, MOST_TABLE_BYTES), 2)
-    except OSError as err:
-        raise DamageError(f"a readable file {path.name} next to it", str(err.strerror)) from err
+    times = _rows(file.read(path), 2)
     if len(times) != len(rows):
         raise DamageError(f"{len(rows)} rows in {path.name}", str(len(times)))
     return FloatRows(rows, times)

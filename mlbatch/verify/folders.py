@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import zlib
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,7 +20,7 @@ _FIRST, _SECOND = ".pcd.bin", ".time.bin"
 _OUTPUTS = (".npz", ".ply", ".pcd", ".las", ".laz", ".bin", ".partial", ".mcap", ".bag")
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class ScanFile:
     """A file of a scan."""
 
@@ -32,13 +33,18 @@ class ScanFile:
     slice: int | None
     # Of the format, with its first dot.
     suffix: str
+    # Sum of the CRC-32 of what was read, modulo 2^32.
+    checksum: int = 0
 
-    def read(self) -> bytes:
-        """The bytes of the file."""
+    def read(self, other: Path | None = None) -> bytes:
+        """The bytes of the file, or of another one of the scan."""
         try:
-            return read_bytes(self.path, MOST_TABLE_BYTES)
+            data = read_bytes(other or self.path, MOST_TABLE_BYTES)
         except OSError as err:
-            raise DamageError("a readable file", str(err.strerror)) from err
+            which = f" {other.name} next to it" if other else ""
+            raise DamageError(f"a readable file{which}", str(err.strerror)) from err
+        self.checksum = (self.checksum + zlib.crc32(data)) % (1 << 32)
+        return data
 
     def check_name(self, log: CheckLog, index: int, part: int, slices: int) -> None:
         """Check the name against index and slice in the file."""
@@ -65,6 +71,7 @@ def readable(
     read: None where a scan is not in its layout.
     """
     for file in files:
+        file.checksum = 0
         try:
             scan = read(file)
         except DamageError as err:
@@ -72,6 +79,7 @@ def readable(
             continue
         log.ok("container")
         if scan is not None:
+            scan.checksum = file.checksum
             yield scan
 
 

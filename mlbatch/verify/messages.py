@@ -5,6 +5,7 @@ Sources: docs/sources/outputs.md sections 2 to 4; sensor_msgs of ROS.
 
 from __future__ import annotations
 
+import zlib
 from collections import Counter
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field, replace
@@ -348,6 +349,7 @@ class TopicChecks:
         window = self.examination.window_of_message(cloud.stamp_ns, number, where)
         scan = stored_scan(replace(cloud, stamp_ns=window.start_ns), where, sensor)
         scan.end_ns = window.end_ns
+        scan.checksum = zlib.crc32(message.data)
         if window.place is not None:
             scan.index = window.place
             scan.slice = 0

@@ -56,6 +56,9 @@ class Output:
         """The result after all checks; limits: why checks are not or only partly possible."""
         totals = examination.totals
         limits = limits | examination.limits
+        if files.table is None or files.table.checksum is None:
+            reason = f"no {TABLE}" if files.table is None else f"a {TABLE} of an earlier version"
+            limits = {"checksum": f"{reason}: it has the checksums"} | limits
         if files.report is None:
             limits = dict.fromkeys(("ledger", "report", "t_init"), _NO_REPORT) | limits
         if not totals.scans and not self.log.violations:

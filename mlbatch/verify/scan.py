@@ -54,6 +54,8 @@ class StoredScan:
     fill: F32Array | None = None
     # Points by time instead of by column.
     by_time: bool = False
+    # Of the bytes: sum of the CRC-32 of its files, or that of the data of its message.
+    checksum: int | None = None
     # Times of points count from the first column of their sensor.
     own_times: bool = False
 

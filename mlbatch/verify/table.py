@@ -21,6 +21,9 @@ _COUNTS = ("points", "columns")
 _COLUMNS = "columns_"
 _GAP = "max_gap_ns_"
 _FILL = "fill_"
+_CHECKSUM = "checksum"
+# Checksums are modulo this.
+_CHECKSUMS = 1 << 32
 # Of a float32, relative.
 _FILL_ERROR = 1e-6
 _WORDS = {"true": True, "false": False}
@@ -53,6 +56,8 @@ class Table:
     gap_ns: I64Array
     # (n, s) float64: columns present / columns expected, NaN: unknown; None in older tables.
     fill: F64Array | None
+    # (n,): of all bytes of the scans, -1: unknown; None in older tables.
+    checksum: I64Array | None
     # (n,) bool
     complete: BoolArray
     _rows: dict[tuple[int, int], int] = field(default_factory=dict)
@@ -87,6 +92,7 @@ def read_table(log: CheckLog, where: str, text: str) -> Table | None:
     names = [*_FIRST, *_COUNTS]
     names += [_COLUMNS + name for name in sensors]
     names += [_GAP + name for name in sensors]
+    names += [_CHECKSUM] if _CHECKSUM in head else []
     missing = [name for name in (*names, "complete") if name not in head]
     if missing or not sensors:
         log.fail("table", where, f"columns {', '.join(missing) or 'of sensors'}", "none")
@@ -136,6 +142,7 @@ def _parsed(
         columns_of=np.stack([number[_COLUMNS + name] for name in sensors], axis=1),
         gap_ns=np.stack([number[_GAP + name] for name in sensors], axis=1),
         fill=fill if fill is not None and fill.shape[1] == len(sensors) else None,
+        checksum=number.get(_CHECKSUM),
         complete=np.array([_WORDS[cell] for cell in cells["complete"]]),
     )
 
@@ -326,6 +333,7 @@ class _RowTotals:
         self.oldest_ns = np.full(count, _LATE_NS)
         self.newest_ns = np.full(count, _EARLY_NS)
         self.incomplete = np.zeros(count, bool)
+        self.checksum = np.zeros(count, np.int64)
 
     def add(self, row: int, scan: StoredScan, points: Points, columns_of: I64Array | None) -> None:
         """Add a scan to its row."""
@@ -333,6 +341,7 @@ class _RowTotals:
         self.points[row] += points.count
         self.columns[row] += len(scan.xyz) if scan.organized else 0
         self.incomplete[row] |= scan.complete is False
+        self.checksum[row] = (self.checksum[row] + (scan.checksum or 0)) % _CHECKSUMS
         if points.time_ns is not None and points.count:
             oldest_ns = scan.start_ns + int(points.time_ns.min())
             newest_ns = scan.start_ns + int(points.time_ns.max())
@@ -472,6 +481,7 @@ class OutputTotals:
                 self._check_gaps(checks, rows, sensor, apart)
         elif self.knows_columns:
             checks.equal("columns", table.columns, rows.columns)
+        self._check_bytes(checks, rows)
         if self.knows_complete:
             bad = table.complete == rows.incomplete
             checks.none("table", "complete", bad, "the value in the scan", table.complete)
@@ -485,6 +495,16 @@ class OutputTotals:
                 checks.none("table", f"{_FILL}{name}", bad, expected, table.fill[:, sensor])
         if self.knows_times:
             self._check_times(checks, rows)
+
+    def _check_bytes(self, checks: _RowChecks, rows: _RowTotals) -> None:
+        """Compare the bytes of the scans with those that were written."""
+        said = checks.table.checksum
+        if said is None or (said < 0).all():
+            return
+        bad = (said != rows.checksum) & (said >= 0) & (rows.scans > 0)
+        at = int(bad.argmax())
+        expected = f"{rows.checksum[at]} of the bytes of the scan"
+        checks.none("checksum", "checksum", bad, expected, said)
 
     def _check_gaps(self, checks: _RowChecks, rows: _RowTotals, sensor: int, apart: bool) -> None:
         """Widest gaps of a sensor: from its last column before a window to the window's end.

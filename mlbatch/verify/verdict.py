@@ -31,6 +31,7 @@ CHECKS = {
     "returns": "return types are in the table",
     "duplicates": "no column occurs twice",
     "table": "scans.csv agrees with the scans",
+    "checksum": "the bytes of a scan are those that were written, by scans.csv",
     "ledger": "every packet, column and point is written or counted",
     "report": "counts and figures of the report agree with the output",
     "tf_static": "one message before all others places every sensor",

@@ -18,7 +18,7 @@ from mlbatch.ros.encoding import Cdr
 from mlbatch.types import Message, RunInfo, Scan, Summary, Topic
 from mlbatch.writers.atomic import export_errors
 from mlbatch.writers.bag_metadata import METADATA, metadata_text, read_file
-from mlbatch.writers.base import ScanJob, WriterOptions, windows_per_file
+from mlbatch.writers.base import ScanJob, WriterOptions, Written, windows_per_file
 from mlbatch.writers.mcap_container import McapContainer
 from mlbatch.writers.message_writer import (
     TF_STATIC,
@@ -30,6 +30,7 @@ from mlbatch.writers.message_writer import (
     stamp_ns,
     static_transforms,
 )
+from mlbatch.writers.output_file import changed_bytes, file_crc, joined_crc
 
 _NAME = re.compile(r"(.*)_(\d+)\.mcap", re.ASCII | re.DOTALL)
 
@@ -60,15 +61,16 @@ class BagWriter(MessageWriter):
             transforms = static_transforms(info, log_ns, Cdr)
             container.send(TF_STATIC, TF_TYPE, log_ns, transforms, latched=True)
 
-        def end_file(container: McapContainer) -> int:
+        def end_file(container: McapContainer) -> tuple[int, int]:
             # By this readers know that report and table are not in the file.
             grid = self._grid(info.t_init_ns) | {"windows_per_file": str(windows)}
             return container.finish_piece(grid)
 
-        def open_files(folder: Path, kept_bytes: int | None) -> MessageFile:
+        def open_files(folder: Path, kept_bytes: int | None, kept_crc: int) -> MessageFile:
             stages = FileStages(new_file, begin_file, end_file)
             names = (folder, target.name)
-            self._bag = BagFiles(names, windows, options.share, stages, kept_bytes)
+            kept = None if kept_bytes is None else (kept_bytes, kept_crc)
+            self._bag = BagFiles(names, windows, options.share, stages, kept)
             return self._bag
 
         super().__init__(target, info, options, Cdr, open_files, folder=True)
@@ -77,6 +79,11 @@ class BagWriter(MessageWriter):
     def bag_files(self) -> int:
         """Number of files that were begun, here or by other shards."""
         return self._bag.files
+
+    @property
+    def checksums(self) -> dict[str, int]:
+        """CRC-32 of the complete files, by name."""
+        return self._bag.checksums
 
     def pass_over(self, scan: Scan) -> ScanJob:
         """Return the job of a scan that another shard writes: it has a place, and no message."""
@@ -113,7 +120,7 @@ class FileStages(NamedTuple):
 
     new: Callable[[Path], McapContainer]
     begin: Callable[[McapContainer, int], None]  # writes the first messages, at a log time
-    end: Callable[[McapContainer], int]  # completes it; gives its bytes
+    end: Callable[[McapContainer], tuple[int, int]]  # completes it; gives bytes and CRC-32
 
 
 class BagFiles:
@@ -128,12 +135,12 @@ class BagFiles:
         windows: int,
         share: tuple[int, int],
         stages: FileStages,
-        kept_bytes: int | None,
+        kept: tuple[int, int] | None,
     ) -> None:
         """names: folder, and what the names of files begin with; windows: in a file.
 
-        share: see `WriterOptions`; kept_bytes: of the files that a continued bag keeps; None: a new
-        bag.
+        share: see `WriterOptions`; kept: bytes of the files that a continued bag keeps, and their
+        CRC-32, one after the other; None: a new bag.
         """
         self._folder, self._stem = names
         self._stages = stages
@@ -145,9 +152,10 @@ class BagFiles:
         self._container: McapContainer | None = None
         self._unfinished: list[McapContainer] = []
         self._pending: list[PendingChunk] = []
-        self._kept = 0 if kept_bytes is None else self._keep(kept_bytes)
-        # Complete files and their bytes.
-        self._done = (self._kept, kept_bytes or 0)
+        self.checksums: dict[str, int] = {}  # CRC-32 of complete files, by name
+        self._kept = 0 if kept is None else self._keep(*kept)
+        # Complete files.
+        self._done = Written(self._kept, *(kept or (0, 0)))
 
     def path(self, number: int) -> Path:
         """Return the path of a file."""
@@ -178,8 +186,8 @@ class BagFiles:
         """Number of the file that the next message is added to."""
         return self._number if self._is_begun else self._number + 1
 
-    def written(self) -> tuple[int, int]:
-        """Return the number of complete files, and their bytes."""
+    def written(self) -> Written:
+        """Return the complete files."""
         return self._done
 
     def take_chunks(self) -> Sequence[PendingChunk]:
@@ -191,12 +199,18 @@ class BagFiles:
         return chunks
 
     def send(
-        self, topic: str, kind: str, log_ns: int, message: bytes | memoryview, latched: bool = False
+        self,
+        topic: str,
+        kind: str,
+        log_ns: int,
+        message: bytes | memoryview,
+        latched: bool = False,
+        crc: int | None = None,
     ) -> None:
         """Append a message of type `kind`, package/Type; the first one creates the topic."""
         container = self._file(log_ns)
         if container is not None:
-            container.send(topic, kind, log_ns, message, latched)
+            container.send(topic, kind, log_ns, message, latched, crc)
 
     def forward(self, message: Message) -> None:
         """Append a recorded message unchanged."""
@@ -225,12 +239,14 @@ class BagFiles:
 
     def complete(self, number: int, container: McapContainer | None) -> None:
         """Complete a file once its chunks are written; None: the file of another shard."""
-        size = 0
+        _, kept_bytes, kept_crc = self._done
         if container is not None:
-            size = self._stages.end(container)
+            size, crc = self._stages.end(container)
             self._unfinished.remove(container)
+            self.checksums[self.path(number).name] = crc
+            kept_bytes, kept_crc = kept_bytes + size, joined_crc(kept_crc, crc, size)
         # One assignment: `written` is called while another scan is appended.
-        self._done = (number + 1, self._done[1] + size)
+        self._done = Written(number + 1, kept_bytes, kept_crc)
 
     def _file(self, log_ns: int) -> McapContainer | None:
         """Return the file of the next message; None if it is not written here."""
@@ -259,23 +275,30 @@ class BagFiles:
         self._container = None
         self._is_begun = False
 
-    def _keep(self, kept_bytes: int) -> int:
+    def _keep(self, kept_bytes: int, kept_crc: int) -> int:
         """Remove all files but the first, of `kept_bytes`; returns the number of the next one."""
         found = (_NAME.fullmatch(path.name) for path in self._folder.iterdir())
         numbers = sorted(int(name[2]) for name in found if name and name[1] == self._stem)
         kept = 0
         left = kept_bytes
+        crc = 0
         for number in numbers:
+            path = self.path(number)
             if left > 0:
-                left -= self.path(number).stat().st_size
+                size = path.stat().st_size
+                self.checksums[path.name] = file_crc(path)
+                crc = joined_crc(crc, self.checksums[path.name], size)
+                left -= size
                 kept = number + 1
             else:
-                self.path(number).unlink()
+                path.unlink()
         if left:
             raise ExportError(
                 f"{self._folder}: expected {kept_bytes} bytes of complete files of the interrupted "
                 f"run, found {kept_bytes - left}; leave out --resume to start over"
             )
+        if crc != kept_crc:
+            raise changed_bytes(self._folder)
         return kept
 
 

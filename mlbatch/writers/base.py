@@ -13,6 +13,8 @@ if TYPE_CHECKING:
 
 DEFAULT_POINT_LAYOUT = "standard"
 NO_COMPRESSION = "none"
+# Number of checksums of scans: sums of CRC-32 are modulo this.
+CHECKSUMS = 1 << 32
 PLY_STYLES = ("standard", "cloudcompare", "float")
 
 
@@ -25,6 +27,7 @@ class WriterOptions(NamedTuple):
     # Bytes to keep of the file in an existing `.partial` (0 where each scan is a file); None: start
     # a new `.partial`.
     kept_bytes: int | None = None
+    kept_crc: int = 0  # CRC-32 of these bytes
     compression: str = NO_COMPRESSION  # none, lz4 or zstd[:level]
     ply_style: str = PLY_STYLES[0]  # names and types of PLY properties
     fsync: bool = True  # force the output to the disk before it gets its name
@@ -38,6 +41,15 @@ class Checkpoint(NamedTuple):
 
     scans: int
     kept_bytes: int = 0  # length of the part of the output file with these scans
+    kept_crc: int = 0  # CRC-32 of that part
+
+
+class Written(NamedTuple):
+    """What the system has of an output file."""
+
+    chunks: int
+    kept_bytes: int  # up to the end of these chunks
+    kept_crc: int  # CRC-32 of these bytes
 
 
 class ScanJob:
@@ -46,7 +58,13 @@ class ScanJob:
     The caller runs all four in this order, each once. `pack` and `compress` run in any thread, at
     the same time as stages of other jobs. `append` and `commit` run in the order of the scans,
     each after the same stage of all earlier jobs.
+
+    checksum: from `pack` on, the sum of the CRC-32 of the files of the scan, or that of the data of
+    its message, as `scans.csv` has it; None: not known. Of a scan that is skipped it is set before,
+    as it was written.
     """
+
+    checksum: int | None = None
 
     def start(self, index: int) -> None:
         """Prepare for the window of the scan: the messages before it follow, then `append`.
@@ -124,6 +142,11 @@ class PartWriter(ScanWriter, Protocol):
     @property
     def bag_files(self) -> int:
         """Number of files that all shards have begun; 0 where every scan has files of its own."""
+        ...
+
+    @property
+    def checksums(self) -> dict[str, int]:
+        """CRC-32 of the complete files of several scans, by name."""
         ...
 
     def pass_over(self, scan: Scan) -> ScanJob:

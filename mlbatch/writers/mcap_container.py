@@ -39,8 +39,8 @@ from mlbatch.errors import ExportError, UsageError
 from mlbatch.ros.definitions import definition, is_known, qos, qos_in_numbers
 from mlbatch.types import Message, Summary, Topic
 from mlbatch.writers.atomic import SCANS_CSV
-from mlbatch.writers.base import NO_COMPRESSION
-from mlbatch.writers.output_file import Bytes, OutputFile, borrow, crc32
+from mlbatch.writers.base import NO_COMPRESSION, Written
+from mlbatch.writers.output_file import Bytes, OutputFile, borrow, crc32, joined_crc
 
 # Compresses so many bytes, given in parts, to one frame.
 Compress: TypeAlias = Callable[[Sequence[Bytes], int], list[Bytes]]
@@ -77,9 +77,11 @@ class Chunk:
     # Log time and offset of the messages of each channel.
     index: dict[int, list[tuple[int, int]]]
     is_kept: bool  # whether a continued file contains it
-    # Of the records, once they are compressed.
+    last_crc: int | None = None  # of the last part, if known
+    # Of the records, and of what is stored, once they are compressed.
     crc: int = 0
     stored: list[Bytes] = field(default_factory=list)
+    stored_crc: int = 0
 
     @property
     def size(self) -> int:
@@ -96,13 +98,25 @@ class Chunk:
         """Compress the records and compute their checksum. Any thread."""
         if self.is_kept:
             return
-        for part in self.records:
-            self.crc = crc32(part, self.crc)
+        *parts, last = self.records
+        self.crc = _crc_of(parts)
+        if self.last_crc is None:
+            self.crc = crc32(last, self.crc)
+        else:
+            self.crc = joined_crc(self.crc, self.last_crc, len(last))
         self.stored = self.container.compressed(self.records, self.size)
+        self.stored_crc = self.crc if self.stored is self.records else _crc_of(self.stored)
 
     def write(self) -> None:
         """Write the chunk and its index; in the order of the chunks."""
         self.container.write_chunk(self)
+
+
+def _crc_of(parts: Sequence[Bytes]) -> int:
+    crc = 0
+    for part in parts:
+        crc = crc32(part, crc)
+    return crc
 
 
 class McapContainer:
@@ -115,13 +129,14 @@ class McapContainer:
         compression: str = NO_COMPRESSION,
         check_topic: Callable[[Topic], None] | None = None,
         on_finish: Callable[[McapContainer], None] | None = None,
+        kept_crc: int = 0,
     ) -> None:
-        """Create a file, or continue the first `kept_bytes` of an existing one.
+        """Create a file, or continue the first `kept_bytes` of an existing one, of this CRC-32.
 
         compression: as in `--compression`; check_topic: called with each forwarded topic, raises
         ExportError to refuse it; on_finish: called once the file is complete and closed.
         """
-        self._file = OutputFile(path, kept_bytes)
+        self._file = OutputFile(path, kept_bytes, kept_crc)
         self._compression, self._new_compress = compression_of(compression)
         self._check_topic = check_topic
         self._on_finish = on_finish
@@ -144,14 +159,20 @@ class McapContainer:
         self._metadata: list[MetadataIndex] = []
         self._file.put(MAGIC)
         self._file.put(encoded(Header("ros2", f"mlbatch {mlbatch.__version__}")))
-        # Number and end of the chunks that the system has; ends of later ones.
-        self._handed = (0, self._file.position_bytes)
-        self._waiting_ends: deque[int] = deque()
+        # What the system has; ends of later chunks, and the CRC-32 up to them.
+        self._handed = Written(0, self._file.position_bytes, self._file.crc)
+        self._waiting_ends: deque[tuple[int, int]] = deque()
 
     # -- messages -----------------------------------------------------------------------------
 
     def send(
-        self, topic: str, kind: str, log_ns: int, message: bytes | memoryview, latched: bool = False
+        self,
+        topic: str,
+        kind: str,
+        log_ns: int,
+        message: bytes | memoryview,
+        latched: bool = False,
+        crc: int | None = None,
     ) -> None:
         """Append a message of type `kind`, package/Type; the first one creates the topic."""
         channel = self._channels.get(topic)
@@ -159,7 +180,7 @@ class McapContainer:
             schema = self._schema(_ros2_name(kind), "ros2msg", definition(kind))
             metadata = {"offered_qos_profiles": qos(latched)}
             channel = self._channels[topic] = self._new_channel(topic, "cdr", metadata, schema)
-        self._append(channel, log_ns, message)
+        self._append(channel, log_ns, message, crc)
 
     def forward(self, message: Message) -> None:
         """Append a recorded message unchanged, on its topic and with its definition."""
@@ -168,14 +189,16 @@ class McapContainer:
             channel = self._forwarded[message.topic] = self._forwarded_channel(message.topic)
         self._append(channel, message.host_ns, message.data)
 
-    def _append(self, channel: Channel, log_ns: int, message: bytes | memoryview) -> None:
+    def _append(
+        self, channel: Channel, log_ns: int, message: bytes | memoryview, crc: int | None = None
+    ) -> None:
         self._index.setdefault(channel.id, []).append((log_ns, len(self._records)))
         length = _MESSAGE.size - _RECORD_HEAD + len(message)
         sequence = self._sent.get(channel.id, 0)
         self._sent[channel.id] = sequence + 1
         self._records += _MESSAGE.pack(Opcode.MESSAGE, length, channel.id, sequence, log_ns, log_ns)
         if len(message) >= LARGE_BYTES:
-            self._end_chunk(message)
+            self._end_chunk(message, crc)
             return
         self._records += message
         if len(self._records) >= CHUNK_BYTES:
@@ -224,11 +247,11 @@ class McapContainer:
         """Number of complete chunks, written or not: the next message is added to this chunk."""
         return self._complete_chunks
 
-    def written(self) -> tuple[int, int]:
-        """Return the number of chunks that the system has, and the bytes up to their end."""
+    def written(self) -> Written:
+        """Return the chunks that the system has."""
         handed_bytes = self._file.handed_bytes
-        while self._waiting_ends and self._waiting_ends[0] <= handed_bytes:
-            self._handed = self._handed[0] + 1, self._waiting_ends.popleft()
+        while self._waiting_ends and self._waiting_ends[0][0] <= handed_bytes:
+            self._handed = Written(self._handed.chunks + 1, *self._waiting_ends.popleft())
         return self._handed
 
     def take_chunks(self) -> list[Chunk]:
@@ -260,7 +283,9 @@ class McapContainer:
             stored_bytes = sum(map(len, chunk.stored))
             length = head_size - _RECORD_HEAD + stored_bytes
             head = _CHUNK.pack(Opcode.CHUNK, length, first_ns, last_ns, size, chunk.crc, len(name))
-            self._file.put(head + name + _SIZE.pack(stored_bytes), *chunk.stored)
+            head += name + _SIZE.pack(stored_bytes)
+            crc = joined_crc(crc32(head, 0), chunk.stored_crc, stored_bytes)
+            self._file.put(head, *chunk.stored, crc=crc)
         index_start = self._file.position_bytes
         index = b""
         offsets = {}
@@ -285,18 +310,18 @@ class McapContainer:
                 uncompressed_size=size,
             )
         )
-        self._waiting_ends.append(self._file.position_bytes)
+        self._waiting_ends.append((self._file.position_bytes, self._file.crc))
 
     def end_chunk(self) -> None:
         """Complete the chunk under construction: no message follows."""
         self._end_chunk(b"")
 
-    def _end_chunk(self, tail: bytes | memoryview) -> None:
-        """Complete the chunk under construction; tail: its last bytes."""
+    def _end_chunk(self, tail: bytes | memoryview, crc: int | None = None) -> None:
+        """Complete the chunk under construction; tail: its last bytes, of this CRC-32 if known."""
         if not self._index:
             return
         is_kept = self._complete_chunks < self._kept_count
-        self._pending.append(Chunk(self, [self._records, tail], self._index, is_kept))
+        self._pending.append(Chunk(self, [self._records, tail], self._index, is_kept, crc))
         self._records = bytearray()
         self._index = {}
         self._complete_chunks += 1
@@ -336,15 +361,15 @@ class McapContainer:
         self._write_attachment(SCANS_CSV, "text/csv", log_ns, summary.scans_csv)
         self._complete()
 
-    def finish_piece(self, grid: dict[str, str]) -> int:
-        """Complete and close one of several files of a run; returns its size in bytes.
+    def finish_piece(self, grid: dict[str, str]) -> tuple[int, int]:
+        """Complete and close one of several files of a run; returns its bytes and their CRC-32.
 
         Report and scans.csv are of the whole run: they are not in it.
         """
         self._write_all_chunks()
         self._write_metadata("mlbatch.grid", grid)
         self._complete()
-        return self._file.position_bytes
+        return self._file.position_bytes, self._file.crc
 
     def _complete(self) -> None:
         self._write_summary()

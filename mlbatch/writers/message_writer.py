@@ -32,8 +32,8 @@ from mlbatch.types import (
     instant_ns,
 )
 from mlbatch.writers.atomic import SCANS_CSV, export_errors, prepare, side_path, write_text
-from mlbatch.writers.base import Checkpoint, ScanJob, WriterOptions
-from mlbatch.writers.output_file import borrow
+from mlbatch.writers.base import Checkpoint, ScanJob, WriterOptions, Written
+from mlbatch.writers.output_file import borrow, crc32
 from mlbatch.writers.point_layouts import CLOUD_LAYOUTS, Layout, Points, points_of
 
 # Limits of what waits for the first scan. Samples: minutes at the rates of built-in IMUs.
@@ -69,8 +69,8 @@ class MessageFile(Protocol):
         """Number of complete chunks, written or not: the next message is added to this chunk."""
         ...
 
-    def written(self) -> tuple[int, int]:
-        """Return the number of chunks that the system has, and the bytes up to their end."""
+    def written(self) -> Written:
+        """Return the chunks that the system has."""
         ...
 
     def take_chunks(self) -> Sequence[PendingChunk]:
@@ -78,9 +78,18 @@ class MessageFile(Protocol):
         ...
 
     def send(
-        self, topic: str, kind: str, log_ns: int, message: bytes | memoryview, latched: bool = False
+        self,
+        topic: str,
+        kind: str,
+        log_ns: int,
+        message: bytes | memoryview,
+        latched: bool = False,
+        crc: int | None = None,
     ) -> None:
-        """Append a message of type `kind`, package/Type; the first one creates the topic."""
+        """Append a message of type `kind`, package/Type; the first one creates the topic.
+
+        crc: CRC-32 of the message, if known.
+        """
         ...
 
     def forward(self, message: Message) -> None:
@@ -97,8 +106,8 @@ class MessageFile(Protocol):
 
 
 NewWire: TypeAlias = Callable[[], Wire]
-# Path, and the bytes to keep of an existing file, None: create a new one.
-OpenFile: TypeAlias = Callable[[Path, int | None], MessageFile]
+# Path, the bytes to keep of an existing file, None: create a new one, and their CRC-32.
+OpenFile: TypeAlias = Callable[[Path, int | None, int], MessageFile]
 
 
 def extras_of(options: WriterOptions, *encodings: str) -> frozenset[str]:
@@ -160,7 +169,7 @@ class MessageWriter:
         imu = (f"/{sensor.name}/imu" for sensor in info.sensors)
         self._own = frozenset({TF_STATIC, *self._topics.values(), *imu})
         with export_errors(self._output.partial):
-            self._file = opener(self._output.partial, options.kept_bytes)
+            self._file = opener(self._output.partial, options.kept_bytes, options.kept_crc)
 
     def write(self, scan: Scan, sensor: int | None = None) -> ScanJob:
         """Return the job that writes a scan as a PointCloud2, after messages that wait for it."""
@@ -176,11 +185,11 @@ class MessageWriter:
 
     def checkpoint(self) -> Checkpoint:
         """Return the scans in written chunks."""
-        chunks, kept_bytes = self._file.written()
-        while self._chunk_of_scan and self._chunk_of_scan[0] < chunks:
+        written = self._file.written()
+        while self._chunk_of_scan and self._chunk_of_scan[0] < written.chunks:
             self._chunk_of_scan.popleft()
             self._written_scans += 1
-        return Checkpoint(self._written_scans, kept_bytes)
+        return Checkpoint(self._written_scans, written.kept_bytes, written.kept_crc)
 
     def write_imu(self, samples: ImuSamples) -> None:
         """Write IMU samples at their own timestamps."""
@@ -232,12 +241,14 @@ class MessageWriter:
             return cloud, cloud.around(scan.packed, stamp_ns(scan), dense)
         return cloud, cloud.assemble(points_of(scan), stamp_ns(scan), dense)
 
-    def send_scan(self, scan: Scan, sensor: int | None, message: memoryview) -> None:
-        """Add the message of a scan to its chunk. In order."""
+    def send_scan(
+        self, scan: Scan, sensor: int | None, message: memoryview, crc: int | None
+    ) -> None:
+        """Add the message of a scan to its chunk; crc: its CRC-32. In order."""
         self.place_scan(scan)
         with export_errors(self._output.partial):
             topic = self._topics[sensor]
-            self._file.send(topic, "sensor_msgs/PointCloud2", stamp_ns(scan), message)
+            self._file.send(topic, "sensor_msgs/PointCloud2", stamp_ns(scan), message, crc=crc)
 
     def place_scan(self, scan: Scan) -> None:
         """Write what precedes a scan, note the chunk that it is in. In order."""
@@ -348,12 +359,14 @@ class _CloudJob(ScanJob):
 
     def pack(self) -> None:
         self._cloud, self._message = self._writer.pack_scan(self._scan, self._is_kept)
+        if not self._is_kept:
+            self.checksum = crc32(self._message, 0)
 
     def start(self, index: int) -> None:
         self._chunks.start(index)
 
     def append(self) -> None:
-        self._writer.send_scan(self._scan, self._sensor, self._message)
+        self._writer.send_scan(self._scan, self._sensor, self._message, self.checksum)
         self._chunks.append()
 
     def compress(self) -> None:

@@ -14,8 +14,9 @@ import os
 import zlib
 from collections import deque
 from collections.abc import Callable, Sequence
+from functools import lru_cache
 from pathlib import Path
-from typing import IO, BinaryIO, TypeAlias, TypeVar, cast
+from typing import IO, TypeAlias, TypeVar, cast
 
 from mlbatch.errors import ExportError
 from mlbatch.writers.direct_writes import DirectWrites
@@ -49,6 +50,54 @@ def _best_checksum() -> Checksum:
 
 
 crc32 = _best_checksum()
+# x^32 + x^26 + ... + 1 without the first term, and x^1; the highest bit is the term of x^0.
+_POLYNOMIAL = 0xEDB88320
+_X = 1 << 30
+_ONE = 1 << 31
+# A piece stays in the cache of a core between its checksum and its copy to the system.
+_PIECE_BYTES = 1 << 18
+
+
+def joined_crc(first: int, second: int, size: int) -> int:
+    """Return the CRC-32 of bytes and `size` more bytes, from those of both.
+
+    A byte multiplies what precedes it by x^8, as in `crc32_combine` of zlib.
+    """
+    return _product(_shift(size), first) ^ second
+
+
+@lru_cache(maxsize=256)
+def _shift(size: int) -> int:
+    """Return x^(8 size) modulo the polynomial."""
+    power, square = _ONE, _X
+    exponent = 8 * size
+    while exponent:
+        if exponent & 1:
+            power = _product(power, square)
+        square = _product(square, square)
+        exponent >>= 1
+    return power
+
+
+def _product(one: int, other: int) -> int:
+    """Return the product of two polynomials modulo the polynomial of CRC-32."""
+    product = 0
+    for bit in range(31, -1, -1):
+        if one >> bit & 1:
+            product ^= other
+        other = other >> 1 ^ (_POLYNOMIAL if other & 1 else 0)
+    return product
+
+
+def file_crc(path: Path, size: int | None = None) -> int:
+    """Return the CRC-32 of a file, or of its first `size` bytes."""
+    crc = 0
+    with path.open("rb", buffering=0) as file:
+        left = os.fstat(file.fileno()).st_size if size is None else size
+        while left and (piece := file.read(min(left, _PIECE_BYTES))):
+            crc = crc32(piece, crc)
+            left -= len(piece)
+    return crc
 
 
 def write_all(file: io.FileIO, parts: Sequence[Bytes]) -> None:
@@ -60,6 +109,25 @@ def write_all(file: io.FileIO, parts: Sequence[Bytes]) -> None:
             count -= len(left.pop(0))
         if count:
             left[0] = left[0][count:]
+
+
+def write_summed(file: io.FileIO, parts: Sequence[Bytes]) -> int:
+    """Write parts as `write_all`; returns the CRC-32 of all."""
+    crc = 0
+    waiting: list[Bytes] = []
+    waiting_bytes = 0
+    for part in parts:
+        view = memoryview(part)
+        for begin in range(0, len(view), _PIECE_BYTES):
+            piece = view[begin : begin + _PIECE_BYTES]
+            crc = crc32(piece, crc)
+            waiting.append(piece)
+            waiting_bytes += len(piece)
+            if waiting_bytes >= _PIECE_BYTES:
+                write_all(file, waiting)
+                waiting, waiting_bytes = [], 0
+    write_all(file, waiting)
+    return crc
 
 
 def drop_from_cache(descriptor: int, begin: int, end: int) -> None:
@@ -97,30 +165,38 @@ class OutputFile:
 
     From its first `_DROP_BYTES` on it is written past the page cache where the system can.
     kept_bytes: length of the part that a continued file keeps, 0 for a new file;
-    position_bytes: of the next byte, written or skipped.
+    position_bytes: of the next byte, written or skipped; crc: CRC-32 of what is before it, in the
+    kept part 0 until its end.
     """
 
-    def __init__(self, path: Path, kept_bytes: int | None) -> None:
-        """kept_bytes: part of an existing file to keep; None: create a new file."""
+    def __init__(self, path: Path, kept_bytes: int | None, kept_crc: int = 0) -> None:
+        """kept_bytes: part of an existing file to keep, and its CRC-32; None: create a new file."""
         self.path = path
         self.kept_bytes = kept_bytes or 0
+        self.crc = 0
+        self._kept_crc = kept_crc
         self.position_bytes = 0
         self._dropped_bytes = 0
         self._direct: DirectWrites | None = None
         self._file = io.FileIO(path, "w+" if kept_bytes is None else "r+")
         if kept_bytes is not None:
-            _truncate(self._file, path, kept_bytes)
+            _truncate(self._file, path, kept_bytes, kept_crc)
 
     def look_at(self, position: int, count: int) -> bytes:
         """Return up to `count` bytes of the file at any position."""
         return os.pread(self._file.fileno(), count, position)
 
-    def put(self, *parts: Bytes) -> None:
-        """Append parts; the end of the kept bytes must not be inside them."""
+    def put(self, *parts: Bytes, crc: int | None = None) -> None:
+        """Append parts, of a known CRC-32 or not; the end of the kept bytes must not be inside."""
         size = sum(map(len, parts))
         if self.position_bytes < self.kept_bytes:
             self.skip(size)
             return
+        if crc is not None:
+            self.crc = joined_crc(self.crc, crc, size)
+        else:
+            for part in parts:
+                self.crc = crc32(part, self.crc)
         if self._direct is None:
             write_all(self._file, parts)
         else:
@@ -145,6 +221,8 @@ class OutputFile:
         self.position_bytes += size
         if self.position_bytes > self.kept_bytes:
             raise _not_as_before(self.path)
+        if self.position_bytes == self.kept_bytes:
+            self.crc = self._kept_crc
 
     def complete(self) -> None:
         """Hand the rest to the system and close the file."""
@@ -157,26 +235,26 @@ class OutputFile:
         self._file.close()
 
 
-def open_buffered(path: Path, kept_bytes: int | None) -> BinaryIO:
-    """Open a file as a library for writing expects it, new or continued; see `OutputFile`."""
-    if kept_bytes is None:
-        return path.open("wb")
-    # A library that writes in order uses no other methods.
-    return cast(BinaryIO, _KeptFile(path, kept_bytes))
+class BufferedFile:
+    """A file with the methods that a library calls which writes in order; see `OutputFile`.
 
+    Drops the first `kept_bytes` that are written; positions include them. crc: CRC-32 of all bytes
+    but overwritten ones.
+    """
 
-class _KeptFile:
-    """Drops the first `kept_bytes` that are written; positions include them."""
-
-    def __init__(self, path: Path, kept_bytes: int) -> None:
+    def __init__(self, path: Path, kept_bytes: int | None, kept_crc: int = 0) -> None:
+        """kept_bytes: part of an existing file to keep, and its CRC-32; None: create a new file."""
+        self.crc = kept_crc
         self._path = path
-        self._left = kept_bytes
-        self._file = path.open("r+b")
-        _truncate(self._file, path, kept_bytes)
+        self._left = kept_bytes or 0
+        self._file = path.open("wb" if kept_bytes is None else "r+b")
+        if kept_bytes is not None:
+            _truncate(self._file, path, kept_bytes, kept_crc)
 
     def write(self, data: Bytes) -> int:
         """Write what follows the kept bytes; their end must not be inside `data`."""
         if not self._left:
+            self.crc = crc32(data, self.crc)
             return self._file.write(data)
         size = memoryview(data).nbytes
         if size > self._left:
@@ -201,8 +279,8 @@ class _KeptFile:
         self._file.close()
 
 
-def _truncate(file: IO[bytes], path: Path, kept_bytes: int) -> None:
-    """Cut a file that is open for reading and writing, and move to its end."""
+def _truncate(file: IO[bytes], path: Path, kept_bytes: int, kept_crc: int) -> None:
+    """Check and cut a file that is open for reading and writing, and move to its end."""
     size = file.seek(0, io.SEEK_END)
     if size < kept_bytes:
         file.close()
@@ -210,8 +288,19 @@ def _truncate(file: IO[bytes], path: Path, kept_bytes: int) -> None:
             f"{path}: expected {kept_bytes} bytes of the interrupted run, found {size}; leave out "
             "--resume to start over"
         )
+    if file_crc(path, kept_bytes) != kept_crc:
+        file.close()
+        raise changed_bytes(path)
     file.truncate(kept_bytes)
     file.seek(kept_bytes)
+
+
+def changed_bytes(path: Path) -> ExportError:
+    """Return the error about an output that was changed after it was written."""
+    return ExportError(
+        f"{path}: expected the bytes that the interrupted run has written, found others; leave out "
+        "--resume to start over"
+    )
 
 
 def _not_as_before(path: Path) -> ExportError:

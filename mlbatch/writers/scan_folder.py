@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
@@ -10,8 +10,22 @@ from typing import Protocol
 from mlbatch.errors import ExportError, UsageError
 from mlbatch.types import ImuSamples, Message, RunInfo, Scan, Summary
 from mlbatch.writers.atomic import SCANS_CSV, export_errors, prepare
-from mlbatch.writers.base import DEFAULT_POINT_LAYOUT, Checkpoint, ScanJob, WriterOptions
-from mlbatch.writers.output_file import Bytes, WriteBehind, borrow, drop_from_cache, write_all
+from mlbatch.writers.base import (
+    CHECKSUMS,
+    DEFAULT_POINT_LAYOUT,
+    Checkpoint,
+    ScanJob,
+    WriterOptions,
+)
+from mlbatch.writers.output_file import (
+    Bytes,
+    WriteBehind,
+    borrow,
+    changed_bytes,
+    drop_from_cache,
+    file_crc,
+    write_summed,
+)
 
 
 class Encoder(Protocol):
@@ -34,6 +48,15 @@ def check_dense(name: str, info: RunInfo) -> None:
         raise UsageError(
             f"--layout organized: expected dense for {name}, found organized; write npz or mcap"
         )
+
+
+def checksum_of(paths: Iterable[Path]) -> int:
+    """Return the checksum of a scan from its files, see `ScanJob`; ExportError for other files."""
+    crcs = []
+    for path in paths:
+        with export_errors(path):
+            crcs.append(file_crc(path))
+    return sum(crcs) % CHECKSUMS
 
 
 @dataclass(frozen=True, slots=True)
@@ -133,18 +156,19 @@ class FolderWriter:
     def abandon(self) -> None:
         """Do nothing: no file is open between jobs."""
 
-    def save(self, scan: Scan, paths: Mapping[str, Path]) -> dict[Path, int]:
-        """Write the files of a scan; returns their sizes in bytes. Any thread."""
+    def save(self, scan: Scan, paths: Mapping[str, Path]) -> tuple[dict[Path, int], int]:
+        """Write the files of a scan; returns their sizes in bytes and checksum. Any thread."""
         sizes = {}
+        crcs = []
         for suffix, path in paths.items():
             idle = self._idle[suffix]
             encoder = borrow(idle, self._encoders[suffix])
             with export_errors(path), path.open("wb", buffering=0) as file:
-                write_all(file, encoder.encode(scan))
+                crcs.append(write_summed(file, encoder.encode(scan)))
                 sizes[path] = file.tell()
                 drop_from_cache(file.fileno(), 0, sizes[path])
             idle.append(encoder)
-        return sizes
+        return sizes, sum(crcs) % CHECKSUMS
 
     def count(self, sizes: Mapping[Path, int]) -> None:
         """Count the files of a scan as complete; sizes: bytes to drop from the cache. In order."""
@@ -163,6 +187,11 @@ class FolderWriter:
     def bag_files(self) -> int:
         """Return 0: every scan has files of its own."""
         return 0
+
+    @property
+    def checksums(self) -> dict[str, int]:
+        """Return nothing: no file has several scans."""
+        return {}
 
     @property
     def folder(self) -> Path:
@@ -195,7 +224,7 @@ class _SaveJob(ScanJob):
         self._sizes: dict[Path, int] = {}
 
     def pack(self) -> None:
-        self._sizes = self._writer.save(self._scan, self._paths)
+        self._sizes, self.checksum = self._writer.save(self._scan, self._paths)
 
     def commit(self) -> None:
         self._writer.count(self._sizes)
@@ -207,6 +236,14 @@ class _KeepJob(ScanJob):
     def __init__(self, writer: FolderWriter, paths: Mapping[str, Path]) -> None:
         self._writer = writer
         self._paths = paths
+
+    def pack(self) -> None:
+        paths = list(self._paths.values())
+        # Of those that are missing `commit` says so.
+        if self.checksum is None or not all(path.is_file() for path in paths):
+            return
+        if checksum_of(paths) != self.checksum:
+            raise changed_bytes(paths[0])
 
     def commit(self) -> None:
         for path in self._paths.values():

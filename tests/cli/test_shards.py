@@ -188,12 +188,30 @@ def test_a_damaged_part_of_a_bag_is_named(shell: Shell, damage: str) -> None:
         with file.open("r+b") as opened:
             opened.seek(-60, os.SEEK_END)
             opened.write(bytes(60))
-        # What was found is named in the words of the mcap library, which differ by its version.
-        expected = "part2/part2_3.mcap: expected a complete MCAP file, found "
-        _refused(shell, folders, 1, expected, "; convert again")
+        expected = "part2/part2_3.mcap: expected the bytes that the shard has written, found others"
+        _refused(shell, folders, 1, expected)
     else:
         _changed("part2", {"files": {"part2_1.mcap": 5}})
         _refused(shell, folders, 1, "expected the 4 files of the bag", "found 3")
+
+
+@pytest.mark.parametrize(
+    ("options", "name"),
+    [
+        ("", "000003.npz"),
+        ("--format nuscenes", "000003.time.bin"),
+        ("--format ply --split", "left/000003.ply"),
+        ("--format rosbag2 --max-bag-duration 0.2 --compression zstd", "part2_3.mcap"),
+    ],
+)
+def test_a_changed_byte_of_a_part_is_named(shell: Shell, options: str, name: str) -> None:
+    folders = _shards(shell, f"{CAPTURE} {options}", 2)
+    file = Path("part2", name)
+    data = bytearray(file.read_bytes())
+    data[len(data) // 2] ^= 1
+    file.write_bytes(data)
+    folder = str(file.parent)
+    _refused(shell, folders, 1, folder, "expected the bytes that the shard has written, found")
 
 
 def test_a_clock_step_is_the_error_of_one_run(shell: Shell) -> None:
@@ -526,7 +544,7 @@ def test_a_field_of_another_kind_is_named(shell: Shell) -> None:
 def test_json_of_others_is_refused(shell: Shell, content: dict[str, int]) -> None:
     _shards(shell, CAPTURE, 2)
     Path("part2/shard.json").write_text(json.dumps(content))
-    found = f"expected schema mlbatch.shard/2, found {content.get('schema')}"
+    found = f"expected schema mlbatch.shard/3, found {content.get('schema')}"
     _refused(shell, ["part1", "part2"], 2, "part2/shard.json", found)
 
 

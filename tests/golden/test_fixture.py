@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 from dataclasses import fields, replace
 from pathlib import Path
 
@@ -185,7 +186,15 @@ def test_split_is_the_merged_scan_cut_by_sensor(folder: Path, tmp_path: Path) ->
             same(part, replace(whole, column=column, ring=ring))
             for key in ("index", "start_ns", "end_ns", "complete", "slice", "frame_id", "sensors"):
                 assert np.array_equal(load(alone / path.name)[key], load(path)[key]), key
-    assert (tmp_path / "split" / "scans.csv").read_bytes() == (folder / "scans.csv").read_bytes()
+    # All but the bytes of the files.
+    rows_split, rows_merged = (
+        [
+            {name: cell for name, cell in row.items() if name != "checksum"}
+            for row in csv.DictReader((path / "scans.csv").read_text().splitlines())
+        ]
+        for path in (tmp_path / "split", folder)
+    )
+    assert rows_split == rows_merged
 
 
 def test_organized_holds_exactly_the_dense_points(folder: Path, tmp_path: Path) -> None:

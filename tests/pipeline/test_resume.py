@@ -196,7 +196,7 @@ def test_an_interrupt_in_a_finalizer_is_not_lost(
     take = resume.ResumeLog.take
     calls = 0
 
-    def ending(log: resume.ResumeLog, *given: Any) -> bool:
+    def ending(log: resume.ResumeLog, *given: Any) -> state_file.FinishedScan | None:
         nonlocal calls
         calls += 1
         if calls == 2:
@@ -412,6 +412,48 @@ def test_a_lost_scan_is_refused(shell: Shell) -> None:
     assert outcome.err.splitlines()[-1] == (
         "mlbatch: error: out.partial/000001.npz: expected a scan of the interrupted run, "
         "found no file; leave out --resume to start over"
+    )
+
+
+@pytest.mark.parametrize("words", ["", "--split", "--format ply", "--format nuscenes"])
+def test_a_changed_byte_of_a_finished_scan_is_refused(shell: Shell, words: str) -> None:
+    words = f"{CAPTURE} -o out {words} --jobs 1"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(resume.ResumeLog, "complete", _refuse)
+        assert shell(f"convert {words}").code == 1
+    files = [path for path in sorted(Path("out.partial").rglob("000001*")) if path.is_file()]
+    for path in files:
+        sound = path.read_bytes()
+        path.write_bytes(sound[:-100] + bytes([sound[-100] ^ 1]) + sound[-99:])
+        outcome = shell(f"convert {words} --resume")
+        assert outcome.code == 1
+        error = outcome.err.splitlines()[-1]
+        assert error.startswith("mlbatch: error: out.partial/")
+        assert path.name.partition(".")[0] in error
+        assert "expected the bytes that the interrupted run has written, found others" in error
+        path.write_bytes(sound)
+    assert shell(f"convert {words} --resume").code == 0
+
+
+@pytest.mark.parametrize("name", ["out.mcap", "out.mcap --compression zstd", "out.bag"])
+def test_a_changed_byte_of_a_file_is_refused(shell: Shell, tmp_path: Path, name: str) -> None:
+    spec = replace(SMALL, beams=128, columns_per_frame=512)
+    capture = write_session(tmp_path / "in", Unit(spec, turns=30))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(resume.ResumeLog, "complete", _refuse)
+        assert shell(f"convert {capture} -o {name}").code == 1
+    partial = Path(f"{name.split()[0]}.partial")
+    kept = _records(Path(f"{partial}.state"))[-2]["kept_bytes"]
+    with partial.open("r+b") as file:
+        file.seek(kept // 2)
+        old = file.read(1)[0]
+        file.seek(-1, os.SEEK_CUR)
+        file.write(bytes([old ^ 1]))
+    outcome = shell(f"convert {capture} -o {name} --resume")
+    assert outcome.code == 1
+    assert outcome.err.splitlines()[-1] == (
+        f"mlbatch: error: {partial}: expected the bytes that the interrupted run has written, "
+        "found others; leave out --resume to start over"
     )
 
 

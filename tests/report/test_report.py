@@ -140,14 +140,14 @@ def test_unknown_reasons_are_found() -> None:
 
 def test_table_of_scans_by_hand() -> None:
     table = ScanTable(run_info())
-    table.add(dense_scan(0, points=3, columns=4))
+    table.add(dense_scan(0, points=3, columns=4), 0xCBF43926)
     table.add(replace(dense_scan(-1, points=1, columns=1), complete=False))
     rows = list(csv.reader(io.StringIO(table.text())))
     assert ",".join(rows[0]) == (
         "index,slice,start_ns,end_ns,first_stamp_ns,last_stamp_ns,points,columns,"
         "columns_left,columns_right,complete,max_gap_ns_left,max_gap_ns_right,"
         "coverage_left,coverage_right,overlap_left,overlap_right,missing_left,missing_right,"
-        "fill_left,fill_right,ready_host_ns"
+        "fill_left,fill_right,checksum,ready_host_ns"
     )
     start = START_NS
     end = START_NS + PERIOD_NS
@@ -155,9 +155,11 @@ def test_table_of_scans_by_hand() -> None:
     times = [start, end, start, last]
     # Nothing is known of rotors here, nor of what the sensors should have sent; see `dense_scan`.
     rest = [*["0.000"] * 4, "NaN", "NaN", 1.0, 0.75]
-    assert rows[1] == list(map(str, [0, 0, *times, 3, 4, 2, 2, "true", 5, 6, *rest, end + 7]))
+    ends = [*rest, 3421780262, end + 7]
+    assert rows[1] == list(map(str, [0, 0, *times, 3, 4, 2, 2, "true", 5, 6, *ends]))
     times = [start - PERIOD_NS, start, start - PERIOD_NS, start - PERIOD_NS]
-    assert rows[2] == list(map(str, [-1, 0, *times, 1, 1, 1, 0, "false", 5, 6, *rest, start + 7]))
+    ends = [*rest, -1, start + 7]
+    assert rows[2] == list(map(str, [-1, 0, *times, 1, 1, 1, 0, "false", 5, 6, *ends]))
     assert len(rows) == 3
 
 
@@ -177,13 +179,13 @@ def test_sensors_of_one_window_share_a_row() -> None:
     right = replace(right, coverage=(0.0, 1.0), overlap=(0.0, 0.5))
     # 70 and 40 columns a second are 7 and 4 in a window of 0.1 s.
     table = ScanTable(run_info(), (70.0, 40.0))
-    table.add(left)
-    table.add(replace(right, complete=False))
+    table.add(left, 0xFFFFFFFF)
+    table.add(replace(right, complete=False), 3)
     _, row = csv.reader(io.StringIO(table.text()))
     last = START_NS + 85_000_000
     turns = ["0.750", "1.000", "0.250", "0.500", 3, 0, 1.0, 0.75]
     assert row[4:] == list(
-        map(str, [START_NS, last, 4, 8, 4, 4, "false", 8, 9, *turns, START_NS + PERIOD_NS + 7])
+        map(str, [START_NS, last, 4, 8, 4, 4, "false", 8, 9, *turns, 2, START_NS + PERIOD_NS + 7])
     )
     assert table.statistics(0).written == 1
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import itertools
 import json
+import zlib
 from collections.abc import Iterator
 from fractions import Fraction
 from pathlib import Path
@@ -284,8 +285,11 @@ def test_complete_files_survive_a_kill(tmp_path: Path) -> None:
     killed.abandon()
     partial = tmp_path / "out.partial"
     kept = [(partial / f"out_{number}.mcap").stat() for number in (0, 1)]
-    assert checkpoint == (4, sum(one.st_size for one in kept))
-    resumed = _write(tmp_path / "out", scans, kept_bytes=checkpoint.kept_bytes)
+    data = b"".join((partial / f"out_{number}.mcap").read_bytes() for number in (0, 1))
+    assert checkpoint == (4, sum(one.st_size for one in kept), zlib.crc32(data))
+    resumed = _write(
+        tmp_path / "out", scans, kept_bytes=checkpoint.kept_bytes, kept_crc=checkpoint.kept_crc
+    )
     resumed.finish(SUMMARY)
     for number in range(3):
         found = (tmp_path / "out" / f"out_{number}.mcap").read_bytes()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import os
+import zlib
 from pathlib import Path
 
 import pytest
@@ -114,7 +115,7 @@ def test_large_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kept: int 
     path = tmp_path / "file"
     if kept is not None:
         path.write_bytes(b"".join(parts)[: kept + 77])
-    file = OutputFile(path, kept)
+    file = OutputFile(path, kept, zlib.crc32(b"".join(parts)[: kept or 0]))
     for part in parts:
         file.put(part, b"-") if part is parts[-1] else file.put(part)
         assert path.stat().st_size >= file.handed_bytes
@@ -122,3 +123,4 @@ def test_large_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kept: int 
     file.complete()
     assert path.read_bytes() == b"".join(parts) + b"-"
     assert file.handed_bytes == len(b"".join(parts)) + 1
+    assert file.crc == zlib.crc32(path.read_bytes())

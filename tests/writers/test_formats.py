@@ -5,6 +5,7 @@ from __future__ import annotations
 import signal
 import subprocess
 import sys
+import zlib
 from dataclasses import replace
 from pathlib import Path
 
@@ -243,7 +244,8 @@ def test_a_continued_output_has_the_same_bytes(
         if partial.is_file():
             with partial.open("ab") as file:
                 file.write(b"of no scan")
-        options = WriterOptions(kept_bytes=checkpoint.kept_bytes)
+        kept = (checkpoint.kept_bytes, checkpoint.kept_crc)
+        options = WriterOptions(kept_bytes=kept[0], kept_crc=kept[1])
         writer = open_writer(name, target, scans[0].info, options)
         for number in range(4):
             scan = scan_of(number)
@@ -258,10 +260,18 @@ def test_a_continued_output_has_the_same_bytes(
         assert files(folder) == expected
 
 
+def _largest(folder: Path) -> Path:
+    """The file of scans below a folder."""
+    files = [path for path in folder.rglob("*") if path.is_file()]
+    return max(files, key=lambda path: path.stat().st_size)
+
+
 @pytest.mark.parametrize("name", CONTAINERS)
 def test_a_file_of_another_length_is_not_continued(name: str, tmp_path: Path) -> None:
     def continued(kept_bytes: int) -> None:
-        writer = open_writer(name, target, run_info(), WriterOptions(kept_bytes=kept_bytes))
+        kept_crc = zlib.crc32(_largest(tmp_path).read_bytes()[:kept_bytes])
+        options = WriterOptions(kept_bytes=kept_bytes, kept_crc=kept_crc)
+        writer = open_writer(name, target, run_info(), options)
         for scan in scans:
             run_job(writer.skip(scan))
 
@@ -270,12 +280,34 @@ def test_a_file_of_another_length_is_not_continued(name: str, tmp_path: Path) ->
     writer = open_writer(name, target, run_info(), WriterOptions())
     for scan in scans:
         run_job(writer.write(scan))
-    kept_bytes = writer.checkpoint().kept_bytes
+    checkpoint = writer.checkpoint()
+    kept_bytes = checkpoint.kept_bytes
     writer.abandon()
     with pytest.raises(ExportError, match=f"expected {kept_bytes + 1} bytes of the interrupted"):
         continued(kept_bytes + 1)
     with pytest.raises(ExportError, match=r"of the interrupted run, found other(s| bytes); leave"):
         continued(kept_bytes - 1)
+
+
+@pytest.mark.parametrize("name", CONTAINERS)
+@pytest.mark.parametrize("place", [0.1, 0.5, 1.0])
+def test_a_file_with_a_changed_byte_is_not_continued(
+    name: str, place: float, tmp_path: Path
+) -> None:
+    target = tmp_path / OUTPUTS[name]
+    writer = open_writer(name, target, run_info(), WriterOptions())
+    for index in range(3):
+        run_job(writer.write(dense_scan(index, 50_000)))
+    kept = writer.checkpoint()
+    writer.abandon()
+    with _largest(tmp_path).open("r+b") as file:
+        file.seek(int((kept.kept_bytes - 1) * place))
+        old = file.read(1)[0]
+        file.seek(-1, 1)
+        file.write(bytes([old ^ 1]))
+    options = WriterOptions(kept_bytes=kept.kept_bytes, kept_crc=kept.kept_crc)
+    with pytest.raises(ExportError, match="expected the bytes that the interrupted run"):
+        open_writer(name, target, run_info(), options)
 
 
 @each_format
