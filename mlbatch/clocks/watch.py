@@ -83,6 +83,16 @@ class Segment(NamedTuple):
     domain: str
     envelope: Envelope
 
+    @property
+    def middle_ns(self) -> int:
+        """Receive time in its middle."""
+        return self.first_host_ns + max(self.last_host_ns - self.first_host_ns, 0) // 2
+
+    @property
+    def offset_ns(self) -> int:
+        """Stamp minus receive time of the fastest packets in its middle."""
+        return int(self.envelope.at(np.array([self.middle_ns], np.int64))[0])
+
 
 class ClockEstimate(NamedTuple):
     """Estimate of a sensor's clock."""
@@ -234,7 +244,6 @@ class ClockWatch:
         longest = max(range(len(track.parts)), key=lambda at: track.parts[at].packets)
         part = track.parts[longest]
         envelope = track.envelopes[longest]
-        at_ns = part.first[1] + part.span_ns // 2
         segments = tuple(
             _segment(track, number, self._period_ns) for number in range(len(track.parts))
         )
@@ -250,9 +259,9 @@ class ClockWatch:
             packets=sum(one.packets for one in self._bins) + (not self._bins),
             damaged=self.damaged + (self._pending is not None and bool(self._bins)),
             domain=_domain(segments, jumps, longest),
-            offset_ns=int(envelope.at(np.array([at_ns], np.int64))[0]),
+            offset_ns=segments[longest].offset_ns,
             uncertainty_ns=SHORTEST_DELAY_NS + scatter_ns + burst_ns,
-            at_host_ns=at_ns,
+            at_host_ns=segments[longest].middle_ns,
             drift_ppm=None if drift is None else drift[0] * _PPM,
             drift_uncertainty_ppm=None if drift is None else drift[1] * _PPM,
             jumps=jumps,

@@ -96,7 +96,7 @@ class StreamReport:
     first_host_ns: int = 0
     last_host_ns: int = 0
     timescale: str = ""
-    offset_ms: float | None = None  # first timestamp minus its receive time
+    offset_ms: float | None = None  # clock minus the capture host's
     calibration: str = ""
     extrinsics: str = ""  # their source, or ""
     missing: str = ""
@@ -442,6 +442,14 @@ class _Measured:
         # Kinds with a packet of this sensor; one that begins late may be of another.
         self.sent: set[PacketKind] = set()
 
+    @property
+    def offset_ns(self) -> int | None:
+        """Clock minus the capture host's; by the log time of a message where that is all."""
+        estimate = self.watch.estimate()
+        if estimate is not None:
+            return estimate.offset_ns
+        return None if self.first is None else self.first[0] - self.first[1]
+
 
 @dataclass(slots=True)
 class _OtherPackets:
@@ -591,6 +599,7 @@ def _stream_report(
         )
     lidar = sensor.lidar
     first = measured[sensor].first
+    offset_ns = measured[sensor].offset_ns
     return replace(
         report,
         what=f"{lidar.model} {lidar.mode}",
@@ -600,7 +609,7 @@ def _stream_report(
         serial=lidar.serial,
         lost=measured[sensor].loss.lost,
         timescale="" if first is None else timescale(*first),
-        offset_ms=None if first is None else (first[0] - first[1]) / NS_PER_MS,
+        offset_ms=None if offset_ns is None else offset_ns / NS_PER_MS,
         calibration=Path(lidar.calibration).name,
         extrinsics=sensor.pose.describe() if sensor.pose.is_known else "",
     )

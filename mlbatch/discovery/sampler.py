@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from mlbatch.arrays import I64Array, U8Array, rows_of
+from mlbatch.batching.intake import extremes
 from mlbatch.clocks.watch import ClockWatch
 from mlbatch.discovery.crowd import Crowd
 from mlbatch.discovery.types import DetectedSensor, PacketKind
@@ -169,16 +170,28 @@ class Sampler:
         return not sensor.streams & self.table.untimed
 
     def clock_offset_ns(self, sensor: DetectedSensor) -> int | None:
-        """First timestamp of a sensor minus its receive time; None without valid columns."""
+        """Clock of a sensor minus the capture host's, up to the first step; None if unknown.
+
+        By the envelope; where packets have no receive times, the first timestamp minus the log time
+        of its message.
+        """
         firsts = []
         for kind in sensor.kinds:
             packets, host_ns = self.good_samples(kind, sensor.lidar)
             headers = sensor.lidar.column_headers(packets, host_ns)
             rows = np.flatnonzero(headers.valid.any(axis=1))
-            if len(rows):
-                row = int(rows[0])
-                stamp_ns = int(headers.stamp_ns[row, int(headers.valid[row].argmax())])
-                firsts.append((int(host_ns[row]), stamp_ns - int(host_ns[row])))
+            if not len(rows):
+                continue
+            row = int(rows[0])
+            stamp_ns = int(headers.stamp_ns[row, int(headers.valid[row].argmax())])
+            offset_ns = stamp_ns - int(host_ns[row])
+            if self.has_receive_times(sensor):
+                _, newest_ns = extremes(headers)
+                watch = clock_watch(sensor.lidar)
+                watch.add(newest_ns[rows], host_ns[rows])
+                estimate = watch.estimate()
+                offset_ns = offset_ns if estimate is None else estimate.segments[0].offset_ns
+            firsts.append((int(host_ns[row]), offset_ns))
         return min(firsts)[1] if firsts else None
 
     def columns_per_s(self, sensor: DetectedSensor) -> float | None:

@@ -406,16 +406,18 @@ def _clock(run: Conversion, sensor: Sensor) -> ClockReport:
     if first is None:
         return ClockReport(source, "unknown", notes=notes)
     epoch = sensor.clock.timescale(*first)
-    offset_ns = first[0] - first[1]
+    # A clock by receive times is in none of these: it is the capture host's.
+    offsets_ns = {one.sensor: one.offset_ns for one in host_offsets(run)}
+    offset_ms = offsets_ns.get(sensor.name, 0) / NS_PER_MS
     finding = dict(run.session.clocks.findings()).get(sensor.name)
     if finding is None:
-        return ClockReport(source, epoch, offset_ns / NS_PER_MS, notes=notes)
+        return ClockReport(source, epoch, offset_ms, notes=notes)
     if sensor.clock.map is not None:
         notes += (sensor.clock.map.describe(),)
     return ClockReport(
         source,
         epoch,
-        offset_to_host_ms=offset_ns / NS_PER_MS,
+        offset_to_host_ms=offset_ms,
         drift_ppm=None if finding.drift_ppm is None else round(finding.drift_ppm, 3),
         notes=(*notes, finding.describe()),
     )

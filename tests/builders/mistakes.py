@@ -387,7 +387,7 @@ MISTAKES: dict[str, tuple[str, int, str]] = {
         1,
         "clocks of the sensors cannot be compared: expected at most 1 s between them, found "
         "3600.000 s (1 whole hour(s): a time zone, or the wrong hour): stamp minus receive time is "
-        "-0.004 s for ouster_111 and -3600.004 s for ouster_222; use --align-clocks or --clock "
+        "-0.001 s for ouster_111 and -3600.001 s for ouster_222; use --align-clocks or --clock "
         "host, or give clock.offset_s or clock.epoch in the rig",
     ),
     "strict with a duplicate": (
@@ -454,8 +454,8 @@ REAL_MISTAKES: dict[str, tuple[str, int, str]] = {
         f"{PAIR} --identity-extrinsics",
         1,
         "clocks of the sensors cannot be compared: expected at most 1 s between them, found "
-        "4923.190 s: stamp minus receive time is -1718733565.192 s for ouster_122239000672 and "
-        "-1718728642.002 s for ouster_122247000785; use --align-clocks or --clock host, or give "
+        "4923.190 s: stamp minus receive time is -1718733565.190 s for ouster_122239000672 and "
+        "-1718728642.000 s for ouster_122247000785; use --align-clocks or --clock host, or give "
         "clock.offset_s or clock.epoch in the rig",
     ),
     "one revolution is never a whole window": (

@@ -109,8 +109,8 @@ class Decoded:
     """Points of velodyne-decoder, by column, ring and range.
 
     at_ns: since 1970; which: 1 strongest (odd block), 2 last (even block), 3 both, which are equal;
-    packet_ns: (P,) stamps of packets; azimuth_cdeg: (P, 12) of their blocks; host_ahead_ms: by how
-    much the first one was received after its stamp.
+    packet_ns: (P,) stamps of packets; azimuth_cdeg: (P, 12) of their blocks; host_ns: (P,)
+    receive times.
     """
 
     xyz: F64Array
@@ -121,7 +121,7 @@ class Decoded:
     which: I64Array
     packet_ns: I64Array
     azimuth_cdeg: I64Array
-    host_ahead_ms: float
+    host_ns: I64Array
 
     @classmethod
     def of(cls, path: Path) -> Decoded:
@@ -147,7 +147,7 @@ class Decoded:
             field["return_type"][order].astype(np.int64),
             packet_ns,
             azimuth_cdeg,
-            float(host_ns[0] - packet_ns[0]) / 1e6,
+            host_ns,
         )
 
     @property
