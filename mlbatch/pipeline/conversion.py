@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import math
 import time
-from collections.abc import Callable, Generator, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple, TypeVar
@@ -23,6 +23,7 @@ from mlbatch.pipeline import run_report
 from mlbatch.pipeline.decode_pool import DecodePool, DecodeTask, Outcomes, with_own_lidars
 from mlbatch.pipeline.job import DEFAULT_RATE, Job
 from mlbatch.pipeline.passthrough import Passthrough
+from mlbatch.pipeline.point_notes import refuse_all_removed
 from mlbatch.pipeline.sensor import Sensor
 from mlbatch.pipeline.session import Session
 from mlbatch.pipeline.time_limits import refuse_outside
@@ -414,7 +415,11 @@ class Conversion:
             self.warn(note)
         self.notes_before_points = len(self.notes)
         # A shard has a part of the points: their notes are made when all are merged.
-        points = [] if self.job.shard is not None else run_report.notes_of_run(self)
+        points: Iterable[Note] = ()
+        if self.job.shard is None:
+            where = ", ".join(map(str, self.job.recordings))
+            refuse_all_removed(where, [sensor.ledger.points for sensor in self.sensors])
+            points = run_report.notes_of_run(self)
         for note in (*points, *run_report.unassigned_notes(self), *self.session.clocks.notes()):
             self.warn(note)
         # A later message may be the first without receive times.

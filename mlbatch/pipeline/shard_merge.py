@@ -20,7 +20,7 @@ from typing import Any
 from mlbatch.errors import ExportError, RecordingError, UsageError
 from mlbatch.pipeline import resume
 from mlbatch.pipeline.job_identity import difference
-from mlbatch.pipeline.point_notes import point_notes
+from mlbatch.pipeline.point_notes import point_notes, refuse_all_removed
 from mlbatch.pipeline.shard_part import Account, ShardScan, read_account
 from mlbatch.pipeline.state_file import State, StateFile, state_path
 from mlbatch.report.ledger import PointCounts
@@ -307,6 +307,8 @@ def _merged_report(parts: Sequence[Part], table: ScanTable, command: str) -> Run
     earlier = account.report
     scans = table.statistics(earlier.scans.empty, earlier.scans.dropped_incomplete)
     sensors = tuple(_merged_sensor(parts, number) for number in range(len(earlier.sensors)))
+    where = ", ".join(one.path for one in earlier.inputs)
+    refuse_all_removed(where, [one.ledger.points for one in sensors])
     notes = tuple(
         Warned(note.code, note.sensor, note.message)
         for note in point_notes([(one.name, one.ledger.points) for one in sensors], scans)

@@ -402,6 +402,21 @@ MISTAKES: dict[str, tuple[str, int, str]] = {
         "drive.pcap: byte 127134: the file ends within a record; expected 1338 bytes, found 1000 "
         "(recording, an error because of --strict)",
     ),
+    # Two whole windows of 512 columns with 16 points, of two lidars.
+    "millimetres for --min-range": (
+        "pair/drive.pcap --identity-extrinsics --min-range 500",
+        1,
+        "pair/drive.pcap: no scan with points: expected points within the limits, found that all "
+        "32768 were removed: 32768 by --min-range and --max-range (min_range_m, max_range_m of the "
+        "rig); widen the range, or make the boxes smaller: both are in metres",
+    ),
+    "a box around everything": (
+        "pair/drive.pcap --identity-extrinsics --exclude-box=-9,-9,-9,9,9,9 -o out.mcap",
+        1,
+        "pair/drive.pcap: no scan with points: expected points within the limits, found that all "
+        "32768 were removed: 32768 by --exclude-box (exclude_boxes_m of the rig); widen the "
+        "range, or make the boxes smaller: both are in metres",
+    ),
     "only partial scans": (
         "short/drive.pcap",
         1,

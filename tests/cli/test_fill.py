@@ -229,9 +229,10 @@ def test_columns_without_points_are_counted(shell: Shell, tmp_path: Path) -> Non
     assert (outcome.code, outcome.warnings) == (0, ["no_points"])
     scans = report_of("out/report.json")["scans"]
     assert (scans["no_points"], scans["empty_clouds"]) == ({"ouster_222": 2}, 0)
-    outcome = shell(f"convert {capture} --identity-extrinsics -o cut.mcap --min-range 5")
+    both = write_session(tmp_path / "dark", replace(LEFT, turns=4, range_mm=0), dark)
+    outcome = shell(f"convert {both} --identity-extrinsics -o dark.mcap")
     assert outcome.warnings == ["no_points", "no_points", "empty_cloud"]
-    scans = report_of("cut.mcap.report.json")["scans"]
+    scans = report_of("dark.mcap.report.json")["scans"]
     assert scans["no_points"] == {"ouster_111": 2, "ouster_222": 2}
     assert (scans["empty_clouds"], scans["points"]) == (2, 0)
     outcome = shell(f"convert {capture} --identity-extrinsics -o split --split")

@@ -108,7 +108,7 @@ def test_every_shard_has_its_scans_and_no_report(shell: Shell) -> None:
         "--align-clocks",
         "--drop-incomplete 70 --fault drop:left:30% --fault-seed 5",
         "--fault stall:left:0.3s-0.5s --max-wait 0.05 --keep-partial",
-        "--exclude-box=-1000,-1000,-1000,1000,1000,1000",
+        "--exclude-box=-1000,-1000,-1000,1000,1000,5",
         "--start +0.2 --end +0.5",
         "--format rosbag2 --max-bag-duration 0.1",
         "--format rosbag2 --max-bag-duration 0.2 --keep-partial --compression zstd:1",
@@ -300,10 +300,18 @@ def test_a_limit_is_checked_on_all_scans(shell: Shell) -> None:
     assert Path("merged/out/report.json").is_file()
 
 
-def test_strict_holds_for_the_points_of_all_scans(shell: Shell) -> None:
-    box = "--exclude-box=-1000,-1000,-1000,1000,1000,1000"
-    folders = _shards(shell, f"{CAPTURE} {box} --strict", 2)
-    one_run = shell(f"convert {CAPTURE} {box} --strict -o one")
+@pytest.mark.parametrize("reason", ["no points of a sensor", "no points at all"])
+def test_what_is_wrong_with_the_points_of_all_scans(shell: Shell, reason: str) -> None:
+    """An error of merge as of one run: with --strict, or without any point."""
+    for file in FIXTURE.iterdir():
+        shutil.copy(file, ".")
+    words = "two_lidars.pcap --rig rig.yaml --exclude-box=-1000,-1000,-1000,1000,1000,1000"
+    if reason == "no points of a sensor":
+        text = Path("rig.yaml").read_text().replace("left\n", "left\n    max_range_m: 0.01\n", 1)
+        Path("rig.yaml").write_text(text)
+        words = "two_lidars.pcap --rig rig.yaml --strict"
+    folders = _shards(shell, words, 2)
+    one_run = shell(f"convert {words} -o one")
     outcome = _merged(shell, folders)
     assert (outcome.code, outcome.err) == (one_run.code, one_run.err)
     assert outcome.code == 1

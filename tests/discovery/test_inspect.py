@@ -82,7 +82,7 @@ def test_json_has_the_same_values_with_all_digits(shell: Shell) -> None:
     assert (left["model"], left["mode"]) == ("OS-0-32-U1", "512x10 RNG19_RFL8_SIG16_NIR16")
     assert (left["bytes"], left["packets"], left["lost"]) == (6400, 271, 0)
     assert left["timescale"] == "utc"
-    # The newest column of 16 of 99.99 ms / 512 is 0.195 ms older than its packet, which takes a while.
+    # The newest of 512 columns in 99.99 ms is 0.195 ms older than its packet, which takes a while.
     assert -1.5 < left["offset_ms"] < -0.195
 
 

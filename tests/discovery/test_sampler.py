@@ -79,8 +79,8 @@ def test_packets_with_new_first_words_are_kept() -> None:
 
 
 def test_rate_and_clock_of_a_sensor(tmp_path: Path) -> None:
-    # 512 columns a revolution of 0.1 s, 16 a packet: it is received 4.125 ms after its first column,
-    # hence 1.1953125 ms after its newest.
+    # 512 columns a revolution of 0.1 s, 16 a packet, which is received 4.125 ms after its first
+    # column, hence 1.1953125 ms after its newest.
     unit = Unit(turns=30)
     late = replace(unit, host_ns=5 * NS_PER_S)
     for name, one, offset_s in (("same", unit, -0.0011953125), ("late", late, -5.0001953125)):
