@@ -148,6 +148,12 @@ class CaptureCounts:
             self.skipped[reason] = self.skipped.get(reason, 0) + count
 
 
+class CutOff(str):
+    """A note of a recording that ends early: its end is missing, or was not read."""
+
+    __slots__ = ()
+
+
 @dataclass(slots=True)
 class Recording:
     """An opened recording; each container derives its own `packets`."""
@@ -163,7 +169,7 @@ class Recording:
     lend: frozenset[str] = field(default=frozenset(), kw_only=True)
     # Frames of the current pass.
     counts: CaptureCounts = field(default_factory=CaptureCounts, kw_only=True)
-    # Damage of the recording, one line each.
+    # Damage of the recording, one line each; `CutOff` where nothing after it was read.
     notes: list[str] = field(default_factory=list, kw_only=True)
     # Newest log time by the container's own index; None: it has none.
     last_ns: int | None = field(default=None, kw_only=True)

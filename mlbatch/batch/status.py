@@ -8,6 +8,7 @@ from pathlib import Path
 from mlbatch.batch.record import SessionRecord, parse_record, read_record
 from mlbatch.batch.session import LOG_TXT, SESSION_JSON, STARTED_JSON, is_url
 from mlbatch.errors import RecordingError
+from mlbatch.report.limits import CUT_OFF
 
 # Warnings of clocks, as in the page of a run.
 CLOCK_CODES = frozenset(
@@ -28,6 +29,16 @@ class SessionStatus:
     def state(self) -> str:
         """done, failed or unfinished: running, or interrupted."""
         return UNFINISHED if self.record is None else self.record.state
+
+    @property
+    def is_cut_off(self) -> bool:
+        """Whether a recording ends early, so that the session is shorter than its drive."""
+        return self.record is not None and CUT_OFF in self.record.warnings
+
+    @property
+    def reason(self) -> str:
+        """Why it failed; of a session that is done, the codes of its warnings."""
+        return "" if self.record is None else self.record.line or ", ".join(self.record.warnings)
 
     @property
     def clock_codes(self) -> list[str]:

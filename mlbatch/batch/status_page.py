@@ -63,12 +63,15 @@ style-src 'unsafe-inline'">
 def _header(title: str, status: BatchStatus) -> str:
     failed = status.count("failed")
     unfinished = status.count(UNFINISHED)
-    level = "problem" if failed else "warning" if unfinished else "good"
+    cut_off = sum(one.is_cut_off for one in status.sessions)
+    level = "problem" if failed else "warning" if unfinished or cut_off else "good"
     heading = f"{failed} of {len(status.sessions)} sessions failed" if failed else ""
     if not heading:
         done = status.count("done")
         heading = f"{done} of {len(status.sessions)} sessions are done"
-    others = f"{unfinished} unfinished: running, or interrupted." if unfinished else ""
+    parts = [f"{unfinished} unfinished: running, or interrupted."] * bool(unfinished)
+    parts += [f"{cut_off} with a recording that was cut off."] * bool(cut_off)
+    others = " ".join(parts)
     return (
         f"<header>\n<h1>{escape(title)}</h1>\n<div class='verdict {level}' id='verdict'>"
         f"<em>{level}</em><strong>{escape(heading)}</strong><p>{escape(others)}</p></div>\n</header>"
@@ -83,6 +86,7 @@ def _cards(status: BatchStatus) -> str:
         "done": f"{status.count('done'):,}",
         "failed": f"{status.count('failed'):,}",
         "unfinished": f"{status.count(UNFINISHED):,}",
+        "cut off": f"{sum(one.is_cut_off for one in status.sessions):,}",
         "scans": f"{sum(one.scans for one in records):,}",
         "lost packets": f"{100 * lost / packets:.3f} %" if packets else "",
         "sessions with clock trouble": f"{sum(bool(one.clock_codes) for one in status.sessions):,}",
@@ -125,7 +129,7 @@ def _row(path: Path, status: BatchStatus, one: SessionStatus) -> str:
             escape(", ".join(one.clock_codes)),
             _gb(record.output_bytes),
             _duration(record.wall_s),
-            escape(record.line or ", ".join(record.warnings)),
+            _reason(one),
         ]
     return "<tr>" + "".join(f"<td>{cell}</td>" for cell in cells) + "</tr>"
 
@@ -154,6 +158,11 @@ def _fill(record: SessionRecord) -> str:
         return ""
     text = f"{100 * record.fill:.1f} %"
     return text if record.fill >= _FILL_WARNING else f"<strong class='warning'>{text}</strong>"
+
+
+def _reason(one: SessionStatus) -> str:
+    text = escape(one.reason)
+    return f"<strong class='problem'>{text}</strong>" if one.is_cut_off else text
 
 
 def _gb(count: int) -> str:

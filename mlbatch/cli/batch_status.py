@@ -76,7 +76,7 @@ def _lines(status: BatchStatus) -> list[str]:
                 ", ".join(one.clock_codes),
                 bytes_text(record.output_bytes) if record.outputs else "",
                 f"{record.wall_s:.1f} s",
-                record.line,
+                one.reason,
             )
         )
     counts = [f"{status.count(state)} {state}" for state in ("done", "failed", "unfinished")]

@@ -19,6 +19,7 @@ _NETWORK = (
 _POWER = "check the sensor's power, cable and log; the windows are written with complete = false"
 # What to do about a warning, by its code (docs/report.md).
 REMEDIES = {
+    "cut_off": "copy the file again, or record with tcpdump -U; scans end where the file does",
     "recording": "copy the file again; the readable part was used",
     "message": "give metadata with --metadata, transforms in a rig file (--rig)",
     "late_stream": "name the sensor in a rig file (--rig)",
@@ -56,7 +57,7 @@ REMEDIES = {
     "clouds": "nothing to do; check that the interpretation is correct",
 }
 _INFORMATION = frozenset({"clouds", "constant_tf"})
-_SERIOUS = frozenset({"clocks", "clock_jump", "recording", "clock_epoch"})
+_SERIOUS = frozenset({"clocks", "clock_jump", "cut_off", "recording", "clock_epoch"})
 
 # Shares of packets or columns.
 _LITTLE, _MUCH = 0.001, 0.01

@@ -21,6 +21,7 @@ from mlbatch.pipeline.sensor import Sensor
 from mlbatch.pipeline.session import CLOUDS
 from mlbatch.pipeline.time_limits import text_of_range, text_of_time
 from mlbatch.report.ledger import ordered
+from mlbatch.report.limits import CUT_OFF
 from mlbatch.report.report import (
     ClockReport,
     FaultReport,
@@ -33,7 +34,7 @@ from mlbatch.report.report import (
     Warned,
 )
 from mlbatch.report.scan_table import ScanStatistics, Spread
-from mlbatch.types import CaptureCounts
+from mlbatch.types import CaptureCounts, CutOff, Recording
 from mlbatch.units import NS_PER_MS, NS_PER_S, rate_text
 
 if TYPE_CHECKING:
@@ -149,11 +150,7 @@ def _epoch_notes(run: Conversion) -> Iterator[Note]:
 
 def final_notes(run: Conversion) -> list[Note]:
     """Warnings known at the end of a run only: damaged recordings, lidars that start late."""
-    notes = [
-        Note("recording", "", f"{recording.path.name}: {text}")
-        for recording in run.session.recordings
-        for text in recording.notes
-    ]
+    notes = [note for recording in run.session.recordings for note in _damage(recording)]
     notes += _cloud_notes(run)
     notes += _epoch_notes(run)
     for sensor in run.sensors:
@@ -180,6 +177,17 @@ def final_notes(run: Conversion) -> list[Note]:
     notes += _motion_notes(run)
     notes += _loss_notes(run)
     return notes
+
+
+def _damage(recording: Recording) -> Iterator[Note]:
+    """Warnings about damage, one for each place, and one about an end that is missing."""
+    name = recording.path.name
+    ends = [text for text in recording.notes if isinstance(text, CutOff)]
+    for text in recording.notes:
+        if text not in ends:
+            yield Note("recording", "", f"{name}: {text}")
+    if ends:
+        yield Note(CUT_OFF, "", f"{name}: {'; '.join(ends)}")
 
 
 def _motion_notes(run: Conversion) -> Iterator[Note]:

@@ -98,6 +98,10 @@ def _without_points(report: Report) -> Iterator[tuple[str, Amount]]:
         yield name, (_number(counts, name), _number(scans, "written"))
 
 
+def _cut_off(report: Report) -> Iterator[tuple[str, Amount]]:
+    yield "", (sum(one.get("code") == CUT_OFF for one in _list(report, "warnings")), 0)
+
+
 def _warnings(report: Report) -> Iterator[tuple[str, Amount]]:
     codes = [one.get("code") for one in _list(report, "warnings")]
     yield "", (sum(code != INFORMATION for code in codes), 0)
@@ -135,6 +139,8 @@ class _Quantity(NamedTuple):
     is_share: bool = True
 
 
+# The warning that a recording ends early.
+CUT_OFF = "cut_off"
 # A warning that is no error with `--strict`.
 INFORMATION = "clouds"
 _QUANTITIES: Mapping[str, _Quantity] = {
@@ -148,5 +154,6 @@ _QUANTITIES: Mapping[str, _Quantity] = {
     "dropped_incomplete": _Quantity(
         "windows left out", partial(_scans, key="dropped_incomplete"), False
     ),
+    "cut_off": _Quantity("recordings cut off", _cut_off, False),
     "warnings": _Quantity("warnings", _warnings, False),
 }

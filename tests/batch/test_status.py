@@ -36,6 +36,31 @@ def test_the_table_has_every_session(data: Dataset) -> None:
     assert found.out.splitlines()[-1] == "4 sessions: 2 done, 1 failed, 1 unfinished"
 
 
+def test_a_recording_that_was_cut_off_is_shown(tmp_path: Path) -> None:
+    """In table, JSON and page of the batch, on the page of the run; by --fail-on it fails."""
+    found = write_dataset(tmp_path / "data", ["a1", "a2"])
+    capture = found.folder / "raw" / "a1" / "drive.pcap"
+    # Within the last record: all packets before it are there, and none counts as lost.
+    capture.write_bytes(capture.read_bytes()[:-100])
+    out = found.folder / "out"
+    assert run(found, out).code == 0
+    lines = command("batch-status", out).out.splitlines()
+    table = {line.split()[0]: line.split() for line in lines}
+    assert (table["a1"][1], table["a1"][3]) == ("done", "0.00")
+    assert (table["a1"][-1], "cut_off" in table["a2"]) == ("cut_off", False)
+    records = json.loads(command("batch-status", out, "--json").out)["sessions"]
+    assert [one["record"]["warnings"] for one in records] == [["cut_off"], []]
+    assert command("batch-status", out, "--page", tmp_path / "status.html").code == 0
+    page = (tmp_path / "status.html").read_text(encoding="utf-8")
+    assert "1 with a recording that was cut off." in page
+    assert page.count("<strong class='problem'>cut_off</strong>") == 1
+    assert "<code>cut_off</code>" in (out / "a1" / "page.html").read_text(encoding="utf-8")
+    strict = found.folder / "strict"
+    assert run(found, strict, "--fail-on", "cut_off>0").table == {"a1": "failed", "a2": "done"}
+    line = "limit exceeded: cut_off>0: found 1 recordings cut off"
+    assert line in command("batch-status", strict).out
+
+
 def test_json_has_the_figures_of_the_reports(data: Dataset) -> None:
     out = data.folder / "out"
     found = json.loads(command("batch-status", out, "--json").out)

@@ -17,11 +17,12 @@ from mlbatch.errors import RecordingError
 from mlbatch.readers import merge, open_recording, readers
 from mlbatch.readers.formats import rosbag2
 from mlbatch.readers.source import Source
-from mlbatch.types import Recording, StreamTable, WrappedRecording
+from mlbatch.types import CutOff, Recording, StreamTable, WrappedRecording
 from tests.builders.bags import fixture_messages
 from tests.builders.captures import Packet, Section, pcap_bytes, section_bytes, udp_frame
 from tests.builders.reading import open_capture, read
 from tests.builders.rosbag2 import write_rosbag2
+from tests.builders.sessions_of_bags import CONTAINERS
 
 CONTENT = pcap_bytes((i, udp_frame(random.Random(i).randbytes(1000))[0]) for i in range(300))
 
@@ -90,6 +91,24 @@ def test_corrupt_compressed_data_end_the_reading(tmp_path: Path) -> None:
     recording = open_capture(tmp_path / "a", buffer_bytes=4000)
     assert len(read(recording)) < 300
     assert "corrupt or cut-off compressed data" in recording.notes[0]
+
+
+@pytest.mark.parametrize("name", CONTAINERS)
+def test_a_recording_that_ends_early_is_cut_off(tmp_path: Path, name: str) -> None:
+    """Half of the file, or of the largest file of a folder; and not one that is whole."""
+    (tmp_path / "whole").mkdir()
+    path = CONTAINERS[name](tmp_path / "whole")
+    for is_whole in (True, False):
+        if not is_whole:
+            files = [path] if path.is_file() else [one for one in path.iterdir() if one.is_file()]
+            last = max(files, key=lambda one: one.stat().st_size)
+            os.truncate(last, last.stat().st_size // 2)
+        recording = open_recording(path, StreamTable())
+        with closing(recording.packets()) as batches:
+            for _ in batches:
+                pass
+        ends = [note for note in recording.notes if isinstance(note, CutOff)]
+        assert bool(ends) == (not is_whole or "cut off" in name), recording.notes
 
 
 def test_compressed_data_without_a_beginning(tmp_path: Path) -> None:

@@ -24,7 +24,7 @@ REPORT = {
         **{"written": 40, "underfilled": 2, "incomplete": 0, "empty": 3, "empty_clouds": 0},
         **{"dropped_incomplete": 4, "no_points": {"b": 5}},
     },
-    "warnings": [{"code": "clouds"}, {"code": "loss"}],
+    "warnings": [{"code": "clouds"}, {"code": "loss"}, {"code": "cut_off"}],
 }
 EXCEEDED = [
     # 10 of 1000 of b, 1 of 1000 of a.
@@ -43,8 +43,10 @@ EXCEEDED = [
     ("empty_clouds>0", ""),
     ("no_points>12%", "no_points>12%: found b: 5 of 40 (12.5 %) scans without its points"),
     # `clouds` is for information.
-    ("warnings>0", "warnings>0: found 1 warnings"),
-    ("warnings>1", ""),
+    ("warnings>1", "warnings>1: found 2 warnings"),
+    ("warnings>2", ""),
+    ("cut_off>0", "cut_off>0: found 1 recordings cut off"),
+    ("cut_off>1", ""),
 ]
 
 

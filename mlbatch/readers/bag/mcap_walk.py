@@ -29,7 +29,7 @@ from mlbatch.readers.bag.mcap_records import (
 from mlbatch.readers.bag.recording import MOST_NOTES
 from mlbatch.readers.byte_records import records
 from mlbatch.readers.source import BUFFER_BYTES, MAX_RECORD_BYTES, Decompressor, Source, Window
-from mlbatch.types import Topic
+from mlbatch.types import CutOff, Topic
 
 _COMPRESSIONS = ("lz4", "zstd")
 _CHANNEL = struct.Struct("<H")
@@ -258,11 +258,11 @@ class Walk:
     def _recover(self, window: Window, fault: str) -> bool:
         """Continue behind the chunk; False outside of chunks, where this is the end."""
         self.lost += 1
-        rest = "file" if self._chunk_end is None else "chunk"
-        self._note(window.place, f"{fault}; the rest of the {rest} was not read")
         if self._chunk_end is None:
+            self._note_end(window.place, f"{fault}; the rest of the file was not read")
             self._done = True
             return False
+        self._note(window.place, f"{fault}; the rest of the chunk was not read")
         window.begin = self._chunk_end - window.place_of(0)
         self._chunk_end = None
         return True
@@ -325,7 +325,7 @@ class Walk:
         if left <= 0 and self._chunk_end is None:
             at_end = "was cut off between records" if left == 0 else "ends within a record"
             place = window.place_of(window.end)
-            self._note(place, f"the file {at_end}: expected its footer; the rest was read")
+            self._note_end(place, f"the file {at_end}: expected its footer; the rest was read")
             return
         opcode = int(Op.MESSAGE)
         expected = HEAD.size
@@ -343,7 +343,7 @@ class Walk:
             expected = self._chunk_end - window.place
             what = "chunk"
         source_fault = f" ({self.source.fault})" if self.source.fault else ""
-        self._note(
+        self._note_end(
             window.place,
             f"the file ends within a {what}{source_fault}: expected {expected} bytes, found "
             f"{max(left, 0)}; complete records were read",
@@ -352,6 +352,10 @@ class Walk:
     def _note(self, place: int, text: str) -> None:
         if len(self.notes) < MOST_NOTES:
             self.notes.append(f"byte {place}: {text}")
+
+    def _note_end(self, place: int, text: str) -> None:
+        """Note why the walk ends early, after any number of other notes."""
+        self.notes.append(CutOff(f"byte {place}: {text}"))
 
 
 def _fault_in_chunk(span: Span, bound: int) -> str:

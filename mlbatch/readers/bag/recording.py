@@ -19,7 +19,16 @@ from mlbatch.readers import CORRECTION_TYPE
 from mlbatch.readers.bag.packet_messages import PACKET_TYPES, PacketsFound, Unpacker
 from mlbatch.ros.definitions import type_key
 from mlbatch.ros.encoding import MessageError
-from mlbatch.types import CaptureCounts, Message, PacketBatch, Recording, Stream, StreamTable, Topic
+from mlbatch.types import (
+    CaptureCounts,
+    CutOff,
+    Message,
+    PacketBatch,
+    Recording,
+    Stream,
+    StreamTable,
+    Topic,
+)
 
 # A file full of damage would fill memory and screen with notes.
 MOST_NOTES = 100
@@ -71,7 +80,7 @@ class BagRecording(Recording):
 
     def lose(self, note: str, count: int = 1) -> None:
         """Note what cannot be read, and count `count` messages of it as truncated."""
-        if len(self.notes) < MOST_NOTES:
+        if len(self.notes) < MOST_NOTES or isinstance(note, CutOff):
             self.notes.append(note)
         self.counts.frames += count
         self.counts.skip("truncated", count)

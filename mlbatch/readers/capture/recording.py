@@ -23,7 +23,7 @@ from mlbatch.readers.capture import link_types
 from mlbatch.readers.capture.fragments import MAX_DATAGRAM_BYTES, Reassembler
 from mlbatch.readers.capture.frames import Addresses, Frames, StreamNumbers, dissect, in_order
 from mlbatch.readers.source import BUFFER_BYTES, Source, Window
-from mlbatch.types import CaptureCounts, PacketBatch, Recording, StreamTable
+from mlbatch.types import CaptureCounts, CutOff, PacketBatch, Recording, StreamTable
 
 # Room for fragments of earlier buffers in addition to those of this one.
 _FRONT_EXTRA_BYTES = 1 << 20
@@ -221,7 +221,7 @@ class _Pass:
     def _end(self, window: Window, walk: Walk, source: Source) -> None:
         """Count a record that the end of the file cuts off."""
         if source.fault:
-            self.recording.notes.append(f"byte {source.position_bytes}: {source.fault}")
+            self.recording.notes.append(CutOff(f"byte {source.position_bytes}: {source.fault}"))
         if window.begin == window.end:
             return
         if walk.need:
@@ -235,7 +235,7 @@ class _Pass:
             self._count_cut()
 
     def _note(self, window: Window, text: str) -> None:
-        self.recording.notes.append(f"byte {window.place}: {text}")
+        self.recording.notes.append(CutOff(f"byte {window.place}: {text}"))
 
     def _count_cut(self) -> None:
         self.recording.counts.frames += 1

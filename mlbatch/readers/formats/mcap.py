@@ -174,7 +174,8 @@ def _portions(
 def _report(recording: BagRecording, walk: Walk, file: Path | None) -> None:
     """Add what a walk could not read to the notes and counts of the recording."""
     name = "" if file is None else f"{file.name}: "
-    recording.notes += [name + note for note in walk.notes]
+    # A note that the file was cut off remains one.
+    recording.notes += [type(note)(name + note) for note in walk.notes]
     recording.counts.frames += walk.lost
     recording.counts.skip("truncated", walk.lost)
 

@@ -24,7 +24,7 @@ from mlbatch.readers.bag.recording import BagRecording, Portion
 from mlbatch.readers.byte_records import records, single
 from mlbatch.readers.source import BUFFER_BYTES, Decompressor, Source, Window, read_head
 from mlbatch.ros.definitions import type_key
-from mlbatch.types import Recording, StreamTable, Topic
+from mlbatch.types import CutOff, Recording, StreamTable, Topic
 from mlbatch.units import NS_PER_S
 
 CONTAINER = "ROS 1 bag"
@@ -100,7 +100,7 @@ def _index(
     try:
         while not len((walked := _walk(window.data, window.begin, window.end)).head):
             if _claims_too_much(window) or not window.refill():
-                return (), None, "the bag ends within its header"
+                return (), None, CutOff("the bag ends within its header")
         fields = _head_fields(_bytes(window.data, walked.head[0], walked.head_size[0]))
         place = _number(fields, "index_pos")
         count = _number(fields, "conn_count")
@@ -111,7 +111,7 @@ def _index(
             )
         if not place:
             note = "the bag was not closed and has no index; it is read record by record"
-            return (), None, note
+            return (), None, CutOff(note)
         if not source.is_plain:
             # A file compressed as a whole is only read in order; its index may be intact.
             return (), None, ""
@@ -122,7 +122,8 @@ def _index(
     except _HeadError as err:
         return (), None, f"the bag's index is damaged ({err}); it is read record by record"
     if len(topics) < count:
-        return (), None, "the bag's index is incomplete; it is read record by record"
+        note = "the bag's index is incomplete; it is read record by record"
+        return (), None, CutOff(note) if place >= source.size_bytes else note
     return tuple(dict.fromkeys(topics)), last_ns, ""
 
 
@@ -438,12 +439,14 @@ class _Pass:
             try:
                 yield from self._records(window.data, walked)
             except _HeadError as err:
-                self._recording.lose(f"{_at(window)}: {err}; the rest of the bag was not read")
+                note = f"{_at(window)}: {err}; the rest of the bag was not read"
+                self._recording.lose(CutOff(note))
                 return
             window.begin = walked.next
             fault = _claims_too_much(window)
             if fault:
-                self._recording.lose(f"{_at(window)}: {fault}; the rest of the bag was not read")
+                note = f"{_at(window)}: {fault}; the rest of the bag was not read"
+                self._recording.lose(CutOff(note))
                 return
             if len(walked.head) < _MOST_RECORDS and not window.refill():
                 yield from self._end(window)
@@ -539,10 +542,11 @@ class _Pass:
         """The bytes left at the end of the file: none, or a part of a record."""
         left = window.end - window.begin
         if self._source.fault:
-            self._recording.notes.append(f"{_at(window)}: {self._source.fault}")
+            self._recording.notes.append(CutOff(f"{_at(window)}: {self._source.fault}"))
         if left <= 0:
             return
-        self._recording.lose(f"{_at(window)}: the bag ends within a record; it was cut off")
+        note = f"{_at(window)}: the bag ends within a record; it was cut off"
+        self._recording.lose(CutOff(note))
         head = window.begin + _WORD_BYTES
         body = head + int.from_bytes(_bytes(window.data, window.begin, _WORD_BYTES), "little")
         # A cut chunk is read like a whole one; that it was cut is already counted.

@@ -31,7 +31,7 @@ from mlbatch.readers.source import (
     decompressed,
 )
 from mlbatch.ros.definitions import definition_text, type_key
-from mlbatch.types import Recording, StreamTable, Topic
+from mlbatch.types import CutOff, Recording, StreamTable, Topic
 
 CONTAINER = "ROS 2 bag (sqlite3)"
 
@@ -184,7 +184,8 @@ class _Database:
                     f"found: {err.strerror}; free some space there, or set TMPDIR to another place"
                 ) from err
             if source.fault:
-                self.notes.append(f"{self.path.name}: {source.fault}; its end is missing")
+                note = f"{self.path.name}: {source.fault}; its end is missing"
+                self.notes.append(CutOff(note))
             return target
 
     def _connect(self) -> sqlite3.Connection:
@@ -196,7 +197,7 @@ class _Database:
                 connection = sqlite3.connect(uri, uri=True, check_same_thread=False)
                 connection.execute("SELECT count(*) FROM sqlite_master").fetchall()
                 return connection
-            note = f"{log.name}: cannot be read with the bag; its last messages are missing"
+            note = CutOff(f"{log.name}: cannot be read with the bag; its last messages are missing")
             self.notes += [note] if note not in self.notes else []
         # Reading may continue in another thread, one at a time; SQLite would insist on the first.
         connection = sqlite3.connect(uri + "&immutable=1", uri=True, check_same_thread=False)
@@ -243,7 +244,8 @@ class _Database:
                         damage.add(note, lost=0)
                         query = by_id
                     else:
-                        damage.add(f"{name}: {err}; the rest of the file was not read")
+                        note = f"{name}: {err}; the rest of the file was not read"
+                        damage.add(CutOff(note))
                 if page.rows:
                     yield page.portion()
 
