@@ -8,9 +8,11 @@ Sources: docs/sources/messages.md sections 2 and 6.
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from decimal import Decimal
 from typing import Literal, NamedTuple, NoReturn, TypeAlias
 
 import numpy as np
@@ -35,6 +37,10 @@ TREE_SOURCES = ("tf_static", "tf", "urdf")
 # Poses farther apart contradict each other.
 MAX_APART_M = 1e-3
 MAX_APART_RAD = 0.1 * RAD_PER_DEG
+# No vehicle has a sensor farther from its body origin; millimetres given for metres are.
+FAR_M = 20.0
+# Angles of mounts are multiples of this, where they are round.
+_EIGHTH_RAD = math.pi / 4
 # Sources print their numbers with different digits; a difference at the bound is accepted.
 _ROUNDING = 1e-9
 
@@ -150,7 +156,10 @@ class ExtrinsicsSources:
                 _refuse_unknown_in_rig(unknown, poses)
             if missing:
                 _refuse_unknown(missing, found.reasons)
+        if missing and identity_extrinsics and (len(poses) > 1 or unknown):
+            notes.append(_not_placed(missing))
         notes += _same_poses(poses)
+        notes += _far_poses(poses)
         if unknown and missing and not identity_extrinsics:
             # A single sensor: no frame of the rig describes its points.
             body_frame = missing[0]
@@ -226,7 +235,7 @@ def place(
     )
     for sensor in sensors:
         sensor.pose = extrinsics.poses[sensor.name]
-    return extrinsics
+    return extrinsics._replace(notes=(*extrinsics.notes, *_radians(sensors)))
 
 
 def _stated(
@@ -445,6 +454,55 @@ def _same_poses(poses: Mapping[str, Pose]) -> Iterator[Note]:
                 )
                 yield _note("same_pose", name, text)
                 break
+
+
+def _not_placed(missing: Sequence[str]) -> Note:
+    """The warning that sensors are at the body origin because no source says where they are."""
+    noun = "sensor" if len(missing) == 1 else "sensors"
+    text = (
+        f"{noun} {', '.join(missing)}: expected extrinsics, found none: at the body origin by "
+        "--identity-extrinsics, clouds fit together only if their points are in the body frame "
+        "already; else give the poses in a rig file (--rig)"
+    )
+    return Note("identity_extrinsics", missing[0] if len(missing) == 1 else "", text)
+
+
+def _far_poses(poses: Mapping[str, Pose]) -> Iterator[Note]:
+    """Warnings about sensors that are too far from the body origin for a vehicle."""
+    for name, pose in poses.items():
+        away_m = float(np.linalg.norm(pose.body_from_sensor[:3, 3]))
+        if away_m > FAR_M:
+            text = (
+                f"expected at most {FAR_M:g} m from the body origin, found {away_m:.6g} m "
+                f"({pose.describe()}): as millimetres this would be {away_m / MM_PER_M:.4g} m; "
+                "give metres, from an origin on the vehicle"
+            )
+            yield _note("far_pose", name, text)
+
+
+def _radians(sensors: Sequence[DetectedSensor]) -> Iterator[Note]:
+    """Warnings about angles of the rig that are round in radians, not in degrees."""
+    for sensor in sensors:
+        angles = () if sensor.rig is None else sensor.rig.rotation_rpy_deg
+        if not any(map(_is_round_in_radians, angles)) or max(map(abs, angles)) > math.pi + 0.01:
+            continue
+        as_given = ", ".join(f"{angle:g}" for angle in angles)
+        turned = ", ".join(f"{angle / RAD_PER_DEG:.4g}" for angle in angles)
+        text = (
+            f"rotation_rpy_deg: expected degrees, found [{as_given}], which is less than 4 degrees "
+            f"as read, and [{turned}] degrees if it was meant as radians; write degrees, or give "
+            "such a small rotation as rotation_xyzw"
+        )
+        yield _note("radians", sensor.name, text)
+
+
+def _is_round_in_radians(angle: float) -> bool:
+    """True for a multiple of pi / 4 to all digits given, of which there are two or more."""
+    exponent = Decimal(repr(angle)).as_tuple().exponent
+    if not isinstance(exponent, int) or exponent > -2:
+        return False
+    nearest = round(angle / _EIGHTH_RAD) * _EIGHTH_RAD
+    return nearest != 0 and abs(angle - nearest) <= 10.0**exponent
 
 
 def _assumed_frames(poses: Mapping[str, Pose], body: str) -> Iterator[Note]:

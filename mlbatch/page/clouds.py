@@ -30,7 +30,7 @@ _BYTE = 255
 _WORD = 65535
 # Shares of the points that the range of a colour covers: single bright points are no scale.
 _LOW, _HIGH = 0.02, 0.98
-# Share of the points inside the first view.
+# Share of the points of a lidar inside the first view.
 _IN_VIEW = 0.97
 _SEED = 0
 
@@ -59,7 +59,8 @@ class PageCloud:
     time: U8Array  # of the window
     intensity: U8Array
     height_m: tuple[float, float]  # range of the colours
-    view_m: float  # radius around the body that contains most points
+    centre_m: tuple[float, float, float]  # of the first view
+    view_m: float  # radius around the centre that contains most points of every lidar
     has_lidar: bool
     has_time: bool
     has_intensity: bool
@@ -275,7 +276,7 @@ def _thinned(place: Place, scans: list[StoredScan], most: int) -> PageCloud:
     low_m: F64Array = xyz.min(axis=0) if len(xyz) else np.zeros(3)
     high_m: F64Array = xyz.max(axis=0) if len(xyz) else np.zeros(3)
     size_m = max(float((high_m - low_m).max()), 1e-3)
-    radius_m = np.linalg.norm(xyz[:, :2], axis=1)
+    centre_m, view_m = _view(xyz, lidar[kept])
     return PageCloud(
         place=place,
         total=total,
@@ -286,11 +287,31 @@ def _thinned(place: Place, scans: list[StoredScan], most: int) -> PageCloud:
         time=_byte(time_ns[kept], 0.0, float(time_ns.max(initial=0.0))),
         intensity=_byte(intensity[kept], *_span(intensity[kept])),
         height_m=_span(xyz[:, 2]),
-        view_m=max(1.0, _quantile(radius_m, _IN_VIEW)),
+        centre_m=(float(centre_m[0]), float(centre_m[1]), float(centre_m[2])),
+        view_m=view_m,
         has_lidar=has_lidar,
         has_time=has_time,
         has_intensity=has_intensity,
     )
+
+
+def _view(xyz: F64Array, lidar: U8Array) -> tuple[F64Array, float]:
+    """Centre (3,) and radius of a view, m, that has most points of every lidar.
+
+    The centre is the body; where the cloud is farther away than it is large, it is that of the
+    cloud.
+    """
+    parts = [xyz[lidar == number] for number in np.unique(lidar)]
+    if not parts:
+        return np.zeros(3), 1.0
+    boxes = np.array([[_span(part[:, axis]) for axis in range(3)] for part in parts])
+    low_m = boxes[:, :, 0].min(axis=0)
+    high_m = boxes[:, :, 1].max(axis=0)
+    centre_m: F64Array = (low_m + high_m) / 2
+    if np.linalg.norm(centre_m) <= np.linalg.norm(high_m - low_m):
+        centre_m = np.zeros(3)
+    away_m = [np.linalg.norm(part[:, :2] - centre_m[:2], axis=1) for part in parts]
+    return centre_m, max(1.0, *(_quantile(away, _IN_VIEW) for away in away_m))
 
 
 def _quantile(values: F64Array, share: float) -> float:

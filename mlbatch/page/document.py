@@ -566,6 +566,7 @@ def _plot_data(report: Values, windows: Windows | None, clouds: list[PageCloud])
             "time": _packed(cloud.time),
             "bright": _packed(cloud.intensity),
             "height": cloud.height_m,
+            "centre": cloud.centre_m,
             "view": cloud.view_m,
             "window_ms": window_ms(windows, cloud.place),
         }

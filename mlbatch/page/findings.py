@@ -40,6 +40,9 @@ REMEDIES = {
     "extrinsics_contradict": "correct one of the sources, or give the pose in a rig file (--rig)",
     "extrinsics_frame": "give the pose in a rig file (--rig): extrinsics: {frame: NAME}",
     "extrinsics_mixed": "give all poses in a rig file (--rig)",
+    "identity_extrinsics": "give the poses in a rig file (--rig); without them clouds do not merge",
+    "far_pose": "give translation_m in metres, from an origin on the vehicle",
+    "radians": "give rotation_rpy_deg in degrees",
     "same_pose": "correct the pose of one of them in the rig file",
     "constant_tf": "nothing to do if the sensor does not move; else publish on /tf_static",
     "urdf": "give the pose in a rig file (--rig)",
@@ -59,6 +62,8 @@ REMEDIES = {
 _INFORMATION = frozenset({"clouds", "constant_tf"})
 _SERIOUS = frozenset({"clocks", "clock_jump", "cut_off", "recording", "clock_epoch"})
 
+# Poses are numbers that no packet contradicts.
+_FINE = "Packets, windows and clocks are fine; poses not checked"
 # Shares of packets or columns.
 _LITTLE, _MUCH = 0.001, 0.01
 # Distance that clocks drift apart during the recording.
@@ -103,7 +108,7 @@ def verdict(found: list[Finding]) -> tuple[Level, str, str]:
     """The overall level, a heading, and the number of other findings in words."""
     level = max((one.level for one in found), default=Level.GOOD)
     if level < Level.WARNING:
-        return Level.GOOD, "Everything is fine", ""
+        return Level.GOOD, _FINE, ""
     problems = sum(one.level == Level.PROBLEM for one in found)
     warnings = sum(one.level == Level.WARNING for one in found)
     parts = [number(problems, "problem")] * (problems > 0)

@@ -423,8 +423,12 @@
     return { ...one, xyz, lidar: unpack(one.lidar), time: unpack(one.time),
       bright: unpack(one.bright) };
   });
-  // One scale for all, so that scans compare.
-  const radius = Math.max(1, ...clouds.map((one) => one.view));
+  // One centre and one scale for all, so that scans compare.
+  const filled = clouds.filter((one) => one.xyz.length);
+  const centre = [0, 1, 2].map((k) =>
+    filled.reduce((sum, one) => sum + one.centre[k] / filled.length, 0));
+  const radius = Math.max(1, ...filled.map((one) => one.view +
+    Math.hypot(one.centre[0] - centre[0], one.centre[1] - centre[1])));
   let chosen = 0;
   let colouring = "height";
   const poses = data.poses.map((pose) => pose);
@@ -532,8 +536,8 @@
     const half = canvas.width / 2;
     // x up, y left; what is higher hides what is lower.
     const project = (x, y, z, out) => {
-      out[0] = half - y * zoom;
-      out[1] = half - x * zoom;
+      out[0] = half - (y - centre[1]) * zoom;
+      out[1] = half - (x - centre[0]) * zoom;
       out[2] = -z;
     };
     splat(size.ctx, cloud, colorsOf(cloud), project, Math.round(Math.max(1, scale)));
@@ -573,12 +577,13 @@
     const focal = canvas.height * 1.05;
     const cosYaw = Math.cos(camera.yaw), sinYaw = Math.sin(camera.yaw);
     const cosPitch = Math.cos(camera.pitch), sinPitch = Math.sin(camera.pitch);
-    // Camera behind the body, looking along x at yaw 0; z is up.
+    // Camera behind the centre, looking along x at yaw 0; z is up.
     const project = (x, y, z, out) => {
-      const ahead = x * cosYaw + y * sinYaw;
-      const left = -x * sinYaw + y * cosYaw;
-      const depth = distance + ahead * cosPitch - z * sinPitch;
-      const up = ahead * sinPitch + z * cosPitch;
+      const dx = x - centre[0], dy = y - centre[1], dz = z - centre[2];
+      const ahead = dx * cosYaw + dy * sinYaw;
+      const left = -dx * sinYaw + dy * cosYaw;
+      const depth = distance + ahead * cosPitch - dz * sinPitch;
+      const up = ahead * sinPitch + dz * cosPitch;
       const factor = depth > .05 ? focal / depth : NaN;
       out[0] = middle[0] - left * factor;
       out[1] = middle[1] - up * factor;
@@ -594,7 +599,9 @@
     cloudColors = colorsOf(clouds[chosen]);
     document.querySelectorAll("canvas.top").forEach(drawTop);
     drawCloud(byId("cloud"));
-    byId("cloudinfo").textContent = "Drawn: the " + clouds[chosen].title + ".";
+    const away = Math.hypot(...centre);
+    byId("cloudinfo").textContent = "Drawn: the " + clouds[chosen].title + "." +
+      (away ? " The centre of the views is " + away.toFixed(0) + " m from the body." : "");
     drawLegend();
     document.querySelectorAll("button[data-colour]").forEach((button) => {
       button.classList.toggle("chosen", button.dataset.colour === colouring);

@@ -25,6 +25,7 @@ from mlbatch.pipeline.segments import ClippedRecording, TimeSegment
 from mlbatch.pipeline.sensor import Limits, Sensor, SensorClock, header_loops, new_ring
 from mlbatch.readers import merge, open_recordings
 from mlbatch.readers.source import BUFFER_BYTES
+from mlbatch.report.limits import ACCEPTED
 from mlbatch.rig.rig import Rig, RigSensor
 from mlbatch.types import PacketBatch, Recording, RunInfo, SensorInfo, StreamTable
 from mlbatch.units import NS_PER_S
@@ -287,7 +288,7 @@ class Session:
 
     def warn(self, note: Note) -> None:
         """Add a warning; RecordingError with `--strict`."""
-        if self.job.strict and note.code != CLOUDS:
+        if self.job.strict and note.code not in ACCEPTED:
             raise RecordingError(f"{note.message} ({note.code}, an error because of --strict)")
         self.notes.append(note)
 

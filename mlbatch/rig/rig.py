@@ -76,9 +76,10 @@ class RigSensor:
     """One sensor of the rig; None: taken from the recording.
 
     extrinsics: (4, 4) float64 body_from_sensor, m, or the name of a frame of the recording, or
-    unknown; extrinsics_files: files that it was read from; clock: sensor or host; epoch: of the
-    sensor's clock, utc, tai or gps; offset_ns: added to the timestamps; decode: options as for
-    `--decode`; points: how its clouds are read; sweeps: its files, of a folder of sweeps.
+    unknown; extrinsics_files: files that it was read from; rotation_rpy_deg: as given, if it is;
+    clock: sensor or host; epoch: of the sensor's clock, utc, tai or gps; offset_ns: added to the
+    timestamps; decode: options as for `--decode`; points: how its clouds are read; sweeps: its
+    files, of a folder of sweeps.
     """
 
     name: str
@@ -87,6 +88,7 @@ class RigSensor:
     metadata: Path | None = None
     extrinsics: F64Array | str | UnknownExtrinsics | None = None
     extrinsics_files: tuple[Path, ...] = ()
+    rotation_rpy_deg: tuple[float, ...] = ()
     clock: str | None = None
     epoch: str | None = None
     offset_ns: int = 0

@@ -605,6 +605,14 @@ def rig_from(root: Node) -> Rig:
     return rig
 
 
+def _rpy_deg(fields: Mapping[str, Node]) -> tuple[float, ...]:
+    """Return roll, pitch and yaw of the extrinsics as given, or none."""
+    node = fields.get("extrinsics")
+    if node is None or "rotation_rpy_deg" not in node.entries:
+        return ()
+    return tuple(_ROTATION_RPY.of(node.entries))
+
+
 def _sensor(node: Node, body_frame: str) -> RigSensor:
     fields = node.fields(names(_SENSOR_KEYS), required=("name",))
     clock = _CLOCK.of(fields)
@@ -624,6 +632,7 @@ def _sensor(node: Node, body_frame: str) -> RigSensor:
         metadata=_METADATA.of(fields),
         extrinsics=extrinsics,
         extrinsics_files=files,
+        rotation_rpy_deg=_rpy_deg(fields),
         clock=_CLOCK_SOURCE.of(clock),
         epoch=_CLOCK_EPOCH.of(clock),
         offset_ns=_CLOCK_OFFSET.of(clock),

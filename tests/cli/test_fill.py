@@ -71,7 +71,7 @@ def _rows(path: str) -> list[dict[str, str]]:
 def test_half_a_second_of_one_lidar(shell: Shell, capture: Path, engine: str, jobs: int) -> None:
     words = f"convert {capture} --identity-extrinsics --engine {engine} --jobs {jobs} -o out"
     outcome = shell(words)
-    assert (outcome.code, outcome.warnings) == (0, ["loss"])
+    assert (outcome.code, outcome.warnings) == (0, ["identity_extrinsics", "loss"])
     scans = report_of("out/report.json")["scans"]
     assert (scans["written"], scans["incomplete"], scans["underfilled"]) == (10, 0, 5)
     assert scans["without"] == {"ouster_222": 4}
@@ -226,17 +226,17 @@ def test_columns_without_points_are_counted(shell: Shell, tmp_path: Path) -> Non
     dark = replace(RIGHT, range_mm=0, turns=4)
     capture = write_session(tmp_path / "s", replace(LEFT, turns=4), dark)
     outcome = shell(f"convert {capture} --identity-extrinsics -o out")
-    assert (outcome.code, outcome.warnings) == (0, ["no_points"])
+    assert (outcome.code, outcome.warnings) == (0, ["identity_extrinsics", "no_points"])
     scans = report_of("out/report.json")["scans"]
     assert (scans["no_points"], scans["empty_clouds"]) == ({"ouster_222": 2}, 0)
     both = write_session(tmp_path / "dark", replace(LEFT, turns=4, range_mm=0), dark)
     outcome = shell(f"convert {both} --identity-extrinsics -o dark.mcap")
-    assert outcome.warnings == ["no_points", "no_points", "empty_cloud"]
+    assert outcome.warnings == ["identity_extrinsics", "no_points", "no_points", "empty_cloud"]
     scans = report_of("dark.mcap.report.json")["scans"]
     assert scans["no_points"] == {"ouster_111": 2, "ouster_222": 2}
     assert (scans["empty_clouds"], scans["points"]) == (2, 0)
     outcome = shell(f"convert {capture} --identity-extrinsics -o split --split")
-    assert outcome.warnings == ["no_points", "empty_cloud"]
+    assert outcome.warnings == ["identity_extrinsics", "no_points", "empty_cloud"]
     assert report_of("split/report.json")["scans"]["empty_clouds"] == 2
     strict = shell(f"convert {capture} --identity-extrinsics -o strict --strict")
     assert (strict.code, "no_points, an error because of --strict" in strict.err) == (1, True)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -17,6 +18,7 @@ from mlbatch.errors import RigError
 from mlbatch.frames.naming import Candidate, candidates
 from mlbatch.frames.transforms import compose, from_rpy_deg, quaternion
 from mlbatch.rig.rig import UnknownExtrinsics
+from tests.builders.sessions import Shell, Unit, write_session
 
 Frames = Mapping[str, Sequence[Candidate]]
 NO_ROTATION = (0.0, 0.0, 0.0, 1.0)
@@ -272,7 +274,10 @@ FOUND = {
             "base_link",
             {"left": [0, 1, 2], "right": [0, 0, 0]},
             {"left": "tf_static: base_link -> left/os_sensor", "right": "identity"},
-            [("extrinsics_frame", "sensor right: none of the recording's frames")],
+            [
+                ("extrinsics_frame", "sensor right: none of the recording's frames"),
+                ("identity_extrinsics", "sensor right: expected extrinsics, found none"),
+            ],
         ),
     ),
     "a single sensor keeps its own frame": (
@@ -404,9 +409,55 @@ def test_where_two_sensors_share_a_pose(
 
 
 def test_sensors_at_the_body_origin_by_request_share_no_pose() -> None:
-    assert Given(identity=True).resolve().notes == ()
-    one_known = Given(rig={"left": _shifted(0.0)}, identity=True)
-    assert one_known.resolve().notes == ()
+    (note,) = Given(identity=True).resolve().notes
+    assert (note.code, note.sensor) == ("identity_extrinsics", "")
+    assert note.message.startswith("sensors left, right: expected extrinsics, found none")
+    (note,) = Given(rig={"left": _shifted(0.0)}, identity=True).resolve().notes
+    assert (note.code, note.sensor) == ("identity_extrinsics", "right")
+    # A single sensor is in its own frame, whatever was asked for.
+    assert Given(SINGLE, identity=True).resolve().notes == ()
+
+
+@pytest.mark.parametrize(
+    ("away_m", "text"),
+    [
+        ((12.0, 12.0, 10.0), ""),
+        # 20 mm for 20 m would be no lever arm of a machine.
+        ((12.0, 12.0, 11.0), "found 20.2237 m (rig): as millimetres this would be 0.02022 m"),
+        ((1500.0, 900.0, 2000.0), "found 2657.07 m (rig): as millimetres this would be 2.657 m"),
+    ],
+)
+def test_sensors_far_from_the_body(away_m: tuple[float, float, float], text: str) -> None:
+    poses = {"left": _shifted(1.0), "right": from_rpy_deg(away_m, (0.0, 0.0, 0.0))}
+    notes = Given(rig=poses).resolve().notes
+    assert [(one.code, one.sensor) for one in notes] == [("far_pose", "right")] * bool(text)
+    assert all(text in one.message for one in notes)
+
+
+# Angles as given, and these as degrees if they were radians, or none: calibrations.
+ANGLES = {
+    "[0, 0, 0]": "",
+    "[0, 0, 1.5708]": "0, 0, 90",
+    "[0, -0.785, 3.14]": "0, -44.98, 179.9",
+    "[0.35, -0.12, 1.57]": "20.05, -6.875, 89.95",
+    "[1.5, 0.2, 3]": "",
+    "[0.4, -0.6, 0.8]": "",
+    # Near a quarter of a turn, not equal to the digits given.
+    "[0.0312, -0.2241, 1.5731]": "",
+    "[0, 22.0, 1.57]": "",
+    "[0, 0, 90]": "",
+}
+
+
+@pytest.mark.parametrize("given_", ANGLES)
+def test_angles_that_are_round_in_radians(shell: Shell, tmp_path: Path, given_: str) -> None:
+    write_session(tmp_path, Unit())
+    pose = f"{{translation_m: [0, 0, 1], rotation_rpy_deg: {given_}}}"
+    (tmp_path / "rig.yaml").write_text(f"sensors:\n  - {{name: top, extrinsics: {pose}}}\n")
+    outcome = shell("convert drive.pcap --rig rig.yaml --dry-run")
+    turned = ANGLES[given_]
+    assert (outcome.code, outcome.warnings) == (0, ["radians"] * bool(turned))
+    assert f"[{turned}] degrees if it was meant as radians" in outcome.err or not turned
 
 
 PLACE = UnknownExtrinsics("rig.yaml:7: sensors[1].extrinsics")

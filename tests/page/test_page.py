@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from mlbatch.page.clouds import choose_places, read_clouds
+from mlbatch.page.clouds import _view, choose_places, read_clouds
 from mlbatch.page.windows import read_windows
 from tests.builders.sessions import FIXTURE, Shell
 from tests.page.runs import report, sensor, table, text
@@ -86,11 +86,38 @@ def test_points_of_a_page_are_those_of_the_scan(shell: Shell) -> None:
         assert cloud.lidar[row] in lidar[far <= step_m]
 
 
+FAR = (
+    # Around the body; 5 km away; two lidars 1.85 km apart, one with a fortieth of the points.
+    ([(0.0, 0.0, 0.0)], [4000], (0.0, 0.0, 0.0), 50.0),
+    ([(3000.0, 4000.0, 50.0)], [4000], (3000.0, 4000.0, 50.0), 50.0),
+    ([(0.0, 0.0, 0.0), (1850.0, 0.0, 0.0)], [4000, 100], (0.0, 0.0, 0.0), 1895.0),
+)
+
+
+@pytest.mark.parametrize(("places", "counts", "centre", "radius"), FAR)
+def test_the_view_has_most_points_of_every_lidar(
+    places: list[tuple[float, float, float]],
+    counts: list[int],
+    centre: tuple[float, float, float],
+    radius: float,
+) -> None:
+    """Rings of 50 m radius around each lidar."""
+    parts = []
+    for place, count in zip(places, counts, strict=True):
+        turn = np.arange(count) * 2.399963
+        ring = np.stack([50 * np.cos(turn), 50 * np.sin(turn), np.sin(7 * turn)], axis=1)
+        parts.append(ring + place)
+    lidar = np.repeat(np.arange(len(counts), dtype=np.uint8), counts)
+    found, view_m = _view(np.concatenate(parts), lidar)
+    assert found == pytest.approx(centre, abs=2)
+    assert view_m == pytest.approx(radius, abs=5)
+
+
 def test_convert_writes_the_page_with_its_command(shell: Shell) -> None:
     outcome = shell(f"convert {FIX} -o scans.mcap --html page.html --quiet")
     assert (outcome.code, outcome.err) == (0, "")
     page = Path("page.html").read_text(encoding="utf-8")
-    assert "Everything is fine" in page
+    assert "Packets, windows and clocks are fine; poses not checked" in page
     assert "mlbatch convert" in page
     assert "--html page.html" in page
     assert Path("page.html").stat().st_size < 1_000_000
