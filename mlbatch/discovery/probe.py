@@ -64,10 +64,11 @@ _RECORDED_SCORE = 10_000
 def with_clouds(
     recordings: Sequence[Recording], table: StreamTable, rig: Rig | None, ignore: Collection[str]
 ) -> tuple[list[Recording], CloudTopics | None]:
-    """The recordings, with decoded clouds on topics in the rig as packets; and these clouds.
+    """The recordings, with decoded clouds as packets; and these clouds.
 
-    Without such topics: all clouds, if the session contains no raw packets. ignore: topics to leave
-    out.
+    All clouds, if the session contains no raw packets: those of lidars that the rig lacks are then
+    counted as unassigned. Else those on topics in the rig, since the others may be made from the
+    packets. ignore: topics to leave out.
     """
     recorded = [topic for recording in recordings for topic in recording.topics]
     if not recorded:
@@ -82,13 +83,15 @@ def with_clouds(
     # A capture has no topics, only packets.
     has_captures = any(not recording.topics for recording in recordings)
     is_raw = has_captures or any(map(has_packets, recorded))
-    chosen = [cloud for name, cloud in clouds.items() if name in topics or not (is_raw or topics)]
+    chosen = [cloud for name, cloud in clouds.items() if name in topics or not is_raw]
     _refuse_points_of_packets(sensors, clouds)
     chosen = [topic for topic in chosen if topic.name not in ignore]
     if not chosen:
         return list(recordings), None
     found = CloudTopics(tuple(chosen), tuple(sensors))
     found.examine(recordings)
+    if topics:
+        found.leave_out_copies(topics)
     if not found.topics:
         return list(recordings), found
     return [CloudRecording(recording, table, found) for recording in recordings], found

@@ -20,7 +20,7 @@ import pytest
 
 import mlbatch
 from tests.builders import datasets as made
-from tests.builders.sessions import REPOSITORY, Shell
+from tests.builders.sessions import REPOSITORY, Outcome, Shell
 
 PAGE = (REPOSITORY / "docs" / "datasets.md").read_text(encoding="utf-8")
 RIGS = REPOSITORY / "examples" / "datasets"
@@ -186,6 +186,51 @@ def test_rows_that_are_converted(shell: Shell, name: str) -> None:
     assert shell("verify scans.mcap").code == 0
 
 
+def test_a_lidar_that_the_rig_lacks_is_named(shell: Shell) -> None:
+    """TIERS has five lidars: the clouds of one that is not in the rig are counted as unassigned."""
+    made.tiers()
+    rig = Path("tiers.yaml").read_text(encoding="utf-8")
+    Path("four.yaml").write_text(rig.partition("  - name: horizon")[0], encoding="utf-8")
+    words = "convert indoor02.bag --rig four.yaml --dry-run"
+    outcome = shell(words)
+    assert (outcome.code, _warnings(outcome)) == (0, ["not_in_rig"])
+    assert "--ignore /livox/lidar" in outcome.err
+    report = json.loads(outcome.out)
+    assert [one["name"] for one in report["sensors"]] == ["os0", "os1", "velodyne", "avia"]
+    (one,) = report["unassigned"]
+    assert (one["stream"], one["packets"]) == ("/livox/lidar", CLOUD_COLUMNS)
+    assert one["what"].startswith("not_in_rig: ")
+    strict = shell(f"{words} --strict")
+    assert (strict.code, "(not_in_rig, an error because of --strict)" in strict.err) == (1, True)
+    ignored = shell(f"{words} --strict --ignore /livox/lidar")
+    assert (ignored.code, _warnings(ignored)) == (0, [])
+    table = shell("inspect indoor02.bag --rig four.yaml")
+    assert "/livox/lidar: " in table.out + table.err
+
+
+@pytest.mark.parametrize(
+    ("topic", "frame", "codes"),
+    [
+        ("/velodyne_points_filtered", "velodyne", []),
+        ("/left/cropped/points", "base_link", []),
+        ("/right/points", "velodyne_2", ["not_in_rig"]),
+    ],
+)
+def test_clouds_made_from_those_in_the_rig_are_no_lidars(
+    shell: Shell, topic: str, frame: str, codes: list[str]
+) -> None:
+    """Copies have the stamps of the headers, in the frame or the namespace of their source."""
+    shift_ns = 2 if codes else 0
+    source = ("/left/points", made.VELODYNE, made.before_end_s)
+    copy = made.clouds(topic, *source[1:], frame=frame, header_ns=made.LAST, clock_ns=shift_ns)
+    depth = made.clouds("/camera/depth/points", made.XYZI, lambda *_: 0.0)
+    made.bag("d.bag", made.clouds(*source, frame="velodyne", header_ns=made.LAST), copy, depth)
+    stream = "stream: {topic: /left/points}, points: {from: end}"
+    Path("rig.yaml").write_text(f"sensors: [{{name: left, {stream}}}]\n", encoding="utf-8")
+    outcome = shell("convert d.bag --rig rig.yaml --dry-run")
+    assert (outcome.code, _warnings(outcome)) == (0, codes), outcome.err
+
+
 @pytest.mark.parametrize("name", [name for name, row in CONVERTED.items() if not row.packets])
 def test_points_are_at_the_times_they_were_measured(shell: Shell, name: str) -> None:
     """Columns of all lidars n ms after the start; float32 and float64 seconds are rounded."""
@@ -211,6 +256,11 @@ def test_points_are_at_the_times_they_were_measured(shell: Shell, name: str) -> 
         # Rounding may put the first column into the window before the first.
         assert expected - found[lidar] <= {0}, lidar
         assert found[lidar] <= expected, lidar
+
+
+def _warnings(outcome: Outcome) -> list[str]:
+    """Codes without those for information."""
+    return [code for code in outcome.warnings if code != "clouds"]
 
 
 def _report() -> dict[str, Any]:

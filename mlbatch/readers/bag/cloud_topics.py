@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, field
 
 from mlbatch.errors import RigError
@@ -79,7 +79,8 @@ class CloudTopics:
     rules: by topic and frame_id; lidars: by topic; layouts: of the packets of each stream; frames:
     frame_id of each stream; first_points_only: whether all but the first cloud of a stream may be
     cut after their first points; refused: why topics cannot be used; ahead_ns: by topic
-    and frame_id, the last points minus the log times; warnings: topic and text.
+    and frame_id, the last points minus the log times; warnings: topic and text; stamps_ns: of the
+    headers of the first messages, by topic.
     """
 
     topics: tuple[Topic, ...]
@@ -93,8 +94,10 @@ class CloudTopics:
     refused: dict[str, str] = field(default_factory=dict)
     ahead_ns: dict[tuple[str, str], int | None] = field(default_factory=dict)
     warnings: list[tuple[str, str]] = field(default_factory=list)
+    stamps_ns: dict[str, set[int]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
+        self.stamps_ns = {topic.name: set() for topic in self.topics}
         self.lidars = {topic.name: TopicLidars() for topic in self.topics}
         for sensor in self.rig:
             if sensor.stream is not None and sensor.stream.topic in self.lidars:
@@ -164,6 +167,28 @@ class CloudTopics:
             self._decide(name, one)
         self.topics = tuple(topic for topic in self.topics if topic.name not in self.refused)
 
+    def leave_out_copies(self, named: Collection[str]) -> None:
+        """Leave out topics that the rig does not name and that are no lidar of their own.
+
+        Those without a time for each point, as of depth cameras, and those made from the clouds of
+        a topic in the rig: they have the stamps of its headers, in its frame or namespace.
+        """
+        for name in self.refused.keys() - named:
+            del self.refused[name]
+        known = [topic.name for topic in self.topics if topic.name in named]
+        self.topics = tuple(
+            topic
+            for topic in self.topics
+            if topic.name in named or not any(self._is_copy(topic.name, of) for of in known)
+        )
+
+    def _is_copy(self, name: str, of: str) -> bool:
+        if not self.stamps_ns[name] & self.stamps_ns[of]:
+            return False
+        namespace = of.rpartition("/")[0]
+        is_near = bool(namespace) and name.startswith(f"{namespace}/")
+        return is_near or bool(self.lidars[name].frames & self.lidars[of].frames)
+
     def _examine(self, message: Message, examined: _Examined, take: Take) -> None:
         name = message.topic.name
         examined.messages += 1
@@ -174,6 +199,7 @@ class CloudTopics:
         except CloudError as err:
             examined.fault = examined.fault or str(err)
             return
+        self.stamps_ns[name].add(head.sample.stamp_ns)
         self.lidars[name].frames.add(head.frame)
         self.lidars[name].ids.update(head.lidar_ids)
         only_id = head.lidar_ids[0] if len(head.lidar_ids) == 1 else None
