@@ -133,10 +133,11 @@ ACCEPTED = {
             "right_1": [twin(NEXT, 222)],
         },
         IDENTITY,
+        warnings=["identity_extrinsics"],
     ),
     # Its columns are missing from the scans of the second part.
     "one that ends with the first part": Parts(
-        {"part_0": BOTH, "part_1": [NEXT]}, IDENTITY, warnings=["loss"]
+        {"part_0": BOTH, "part_1": [NEXT]}, IDENTITY, warnings=["identity_extrinsics", "loss"]
     ),
     "one that moves to another address": Parts(
         {"part_0": [ONE], "part_1": [replace(NEXT, ip="10.0.0.9")]}

@@ -153,7 +153,9 @@ def test_without_transforms_it_is_refused(tmp_path: Path) -> None:
         "more; give them in a rig file (--rig), /tf_static or metadata (ouster-sdk extrinsic), or "
         "accept the body origin with --identity-extrinsics"
     )
-    assert convert(tmp_path / "scans", bag, "--identity-extrinsics").warnings == []
+    assert convert(tmp_path / "scans", bag, "--identity-extrinsics").warnings == [
+        ("identity_extrinsics", "")
+    ]
 
 
 @pytest.mark.parametrize(("x_m", "warns"), [(0.3, False), (0.3009, False), (0.35, True)])

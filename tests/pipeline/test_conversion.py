@@ -88,10 +88,11 @@ def test_mixed_timescales_are_told(tmp_path: Path) -> None:
     two = replace(twin(one, 222), host_ns=2_300 * NS_PER_MS)
     run, report = convert(_job(write_session(tmp_path, one, two), identity=True), None)
     assert report.timescale == "unknown"
-    assert [(note.code, note.message) for note in run.notes[:1]] == [
+    assert [(note.code, note.message) for note in run.notes[1:2]] == [
         ("timescale", "sensors differ in timescale: utc, unknown")
     ]
-    assert [note.code for note in run.notes[1:]] == ["clock_epoch", "clocks"]
+    codes = [note.code for note in run.notes]
+    assert codes == ["identity_extrinsics", "timescale", "clock_epoch", "clocks"]
 
 
 # -- progress and report ---------------------------------------------------------------------------
