@@ -400,7 +400,7 @@ MISTAKES: dict[str, tuple[str, int, str]] = {
         "cut/drive.pcap --strict",
         1,
         "drive.pcap: byte 127134: the file ends within a record; expected 1338 bytes, found 1000 "
-        "(recording, an error because of --strict)",
+        "(cut_off, an error because of --strict)",
     ),
     # Two whole windows of 512 columns with 16 points, of two lidars.
     "millimetres for --min-range": (
