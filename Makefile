@@ -103,7 +103,7 @@ fuzz-sanitized: $(VENV)/dev.stamp
 		$(BIN)/python -m tests.fuzz.run --target compiled --inputs $(INPUTS) --seed $(SEED) --minutes $(MINUTES)
 
 clean:
-	rm -rf $(VENV) $(LOWEST) $(CONSUMERS) $(ODOMETRY) demo build mlbatch.egg-info .coverage .*_cache .hypothesis
+	rm -rf $(VENV) $(LOWEST) $(CONSUMERS) $(ODOMETRY) demo build mlbatch*.egg-info .coverage .*_cache .hypothesis
 
 # The environment is updated when pyproject.toml or a C source changes.
 $(VENV)/bin/python:

@@ -75,7 +75,7 @@ class Interrupted(MlbatchError):
 
 def install_extra(extra: str) -> str:
     """Return the command that installs an extra; also right after an installation from a clone."""
-    return f"pip install 'mlbatch[{extra}]'"
+    return f"pip install 'mlbatch-lidar[{extra}]'"
 
 
 def write_error(path: object, err: OSError) -> ExportError:

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 from mlbatch.batch.driver import Result, failure
 from mlbatch.batch.task import Task, run_session
-from mlbatch.errors import DiskFullError, ExportError, UsageError
+from mlbatch.errors import DiskFullError, ExportError, UsageError, install_extra
 
 if TYPE_CHECKING:
     from distributed import Client
@@ -33,7 +33,7 @@ def by_dask(
     except ImportError as err:
         raise UsageError(
             f"--scheduler: expected the package distributed, found none ({err}); "
-            'pip install "mlbatch[dask]"'
+            f"{install_extra('dask')}"
         ) from err
     client = _connected(address)
     try:

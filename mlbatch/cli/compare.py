@@ -70,7 +70,7 @@ def compare(
     figures: Annotated[
         Path | None,
         typer.Option(
-            help="Also write figures for papers (PDF, PNG); needs mlbatch[plot].", metavar="DIR"
+            help="Also write figures for papers (PDF, PNG); needs the extra plot.", metavar="DIR"
         ),
     ] = None,
     overwrite: Annotated[

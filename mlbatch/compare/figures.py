@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from mlbatch.errors import ExportError
+from mlbatch.errors import ExportError, install_extra
 from mlbatch.page.policies import SPEEDS_KMH, PolicyFigures, offset_m, quantile
 
 if TYPE_CHECKING:
@@ -26,8 +26,8 @@ def check_figures(folder: Path, *, overwrite: bool) -> None:
         import matplotlib  # noqa: F401
     except ImportError as err:
         raise ExportError(
-            "--figures: expected matplotlib, found none; install it with `pip install "
-            "mlbatch[plot]`"
+            f"--figures: expected the package matplotlib, found none ({err}); "
+            f"{install_extra('plot')}"
         ) from err
     if folder.exists() and not folder.is_dir():
         raise ExportError(f"{folder}: expected a folder for figures, found a file; choose another")

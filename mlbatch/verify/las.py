@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from mlbatch.arrays import BoolArray, F32Array, F64Array, I64Array
+from mlbatch.errors import install_extra
 from mlbatch.verify.commented import CommentedReader, StoredPoints
 from mlbatch.verify.comments import ScanComments
 from mlbatch.verify.containers import check_unpacked_size, library_errors
@@ -88,7 +89,7 @@ def load_laspy(what: str) -> ModuleType:
     except ImportError as err:
         raise VerifyError(
             f"{what}: expected the packages laspy and lazrs to read LAS and LAZ, found none "
-            f"({err}); pip install 'mlbatch[las]'"
+            f"({err}); {install_extra('las')}"
         ) from err
 
 

@@ -18,7 +18,7 @@ import numpy.typing as npt
 import mlbatch
 from mlbatch.arrays import F64Array, I32Array, I64Array, U8Array
 from mlbatch.clocks.timescale import GPS_EPOCH_S, TAI, TAI_GPS_S, UTC, gps_utc_s
-from mlbatch.errors import ExportError, UsageError
+from mlbatch.errors import ExportError, UsageError, install_extra
 from mlbatch.types import Scan
 from mlbatch.units import NS_PER_S
 from mlbatch.writers.output_file import Bytes
@@ -58,7 +58,7 @@ def load_laspy(name: str) -> ModuleType:
     except ImportError as err:
         raise UsageError(
             f"--format {name}: expected the packages laspy and lazrs, found none ({err}); "
-            "pip install 'mlbatch[las]'"
+            f"{install_extra('las')}"
         ) from err
 
 

@@ -167,9 +167,10 @@ def test_figures_without_matplotlib(shell: Shell, monkeypatch: pytest.MonkeyPatc
     monkeypatch.setitem(sys.modules, "matplotlib", None)
     outcome = shell(f"compare {CAPTURE} --figures plots")
     assert (outcome.code, outcome.out) == (1, "")
-    assert outcome.err == (
-        "mlbatch: error: --figures: expected matplotlib, found none; install it with `pip install "
-        "mlbatch[plot]`\n"
+    assert re.fullmatch(
+        r"mlbatch: error: --figures: expected the package matplotlib, found none \(.*\); "
+        r"pip install 'mlbatch-lidar\[plot\]'\n",
+        outcome.err,
     )
 
 

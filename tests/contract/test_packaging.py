@@ -136,3 +136,28 @@ def test_the_engine_is_built_from_all_its_sources() -> None:
     names = [path.relative_to(PACKAGE.parent).as_posix() for path in sorted(native.glob("*.c"))]
     assert extension["sources"] == names
     assert extension["depends"] == ["mlbatch/native/native.h"]
+
+
+def test_nothing_installs_the_package_of_others() -> None:
+    """On PyPI `mlbatch` is another package; requirements and hints name the distribution."""
+    assert _settings("project")["name"] == "mlbatch-lidar"
+    foreign = re.compile(
+        r"pip install [\"']?mlbatch(?![-\w])|\bmlbatch\[\w|dependencies = .*\"mlbatch[^-]"
+    )
+    folders = [ROOT / name for name in ("docs", "examples", "mlbatch", ".ci")]
+    paths = [path for folder in folders for path in folder.rglob("*") if path.is_file()]
+    paths += [
+        ROOT / name for name in ("README.md", "CONTRIBUTING.md", "Makefile", "pyproject.toml")
+    ]
+    for path in paths:
+        if path.suffix in (".py", ".md", ".toml", ".txt", ""):
+            text = path.read_text(encoding="utf-8")
+            assert not foreign.findall(text), path
+
+
+def test_every_extra_is_in_the_readme() -> None:
+    """With the command that installs it from a clone."""
+    extras = set(_settings("project", "optional-dependencies")) - {"dev", "docs", "compiler"}
+    readme = (ROOT / "README.md").read_text(encoding="utf-8")
+    assert "pip install '.[las]'" in readme
+    assert extras <= set(re.findall(r"`(\w+)`", readme.partition("## Use")[0]))

@@ -149,5 +149,5 @@ def test_a_missing_package_is_one_line(
     with pytest.raises(UsageError) as caught:
         check_target(name, tmp_path / "x", WriterOptions(), "dense")
     assert str(caught.value).startswith(f"--format {name}: expected the packages laspy and lazrs")
-    assert str(caught.value).endswith("; pip install 'mlbatch[las]'")
+    assert str(caught.value).endswith("; pip install 'mlbatch-lidar[las]'")
     assert not list(tmp_path.iterdir())
