@@ -10,50 +10,10 @@ import numpy as np
 from mlbatch.arrays import F64Array, I64Array
 from tests.recordings import RECORDINGS
 from tests.recordings.references import read_pcd, xyz_of
+from tests.reference import hesai_firing
 
 FOLDER = RECORDINGS / "hesai"
 DUAL = "dual return, last and strongest"
-
-# Section 12, typed once more: when beams fire after the time of their block, channel by channel.
-_P40_NS = """
--42220 -28470 -16040 -3620 -45490 -31740 -47460 -54670 -20620 -33710
--40910 -8190 -20620 -27160 -50730 -8190 -14740 -36980 -45490 -52700
--23890 -31740 -38950 -11470 -18650 -25190 -48760 -6230 -12770 -35010
--21920 -9500 -43520 -29770 -17350 -4920 -42220 -28470 -16040 -3620
-"""
-_P64_NS = """
--23180 -21876 -20572 -19268 -17964 -16660 -11444 -46796
--7532 -36956 -50732 -54668 -40892 -44828 -31052 -34988
--48764 -52700 -38924 -42860 -29084 -33020 -46796 -25148
--36956 -50732 -27116 -40892 -44828 -31052 -34988 -48764
--25148 -38924 -42860 -29084 -33020 -52700 -6228 -54668
--15356 -27116 -10140 -23180 -4924 -21876 -14052 -17964
--8836 -19268 -3620 -20572 -12748 -16660 -7532 -11444
--6228 -15356 -10140 -4924 -3620 -14052 -8836 -12748
-"""
-_QT64_NS = """
-2310 4370 6430 8490 10540 12600 14660 16710
-19160 21220 23280 25340 27390 29450 31500 33560
-36610 38670 40730 42780 44840 46900 48950 51010
-53450 55520 57580 59630 61690 63740 65800 67860
-70900 72970 75020 77080 79140 81190 83250 85300
-87750 89820 91870 93930 95980 98040 100100 102150
-105200 107260 109320 111380 113430 115490 117540 119600
-122050 124110 126170 128220 130280 132340 134390 136450
-"""
-
-
-def _numbers(text: str) -> tuple[int, ...]:
-    return tuple(int(word) for word in text.split())
-
-
-FIRING_NS = {
-    "Pandar40P": _numbers(_P40_NS),
-    "Pandar64": _numbers(_P64_NS),
-    "PandarQT64": _numbers(_QT64_NS),
-    "PandarXT-16": tuple(range(368, 368 + 16 * 3024, 3024)),
-    "PandarXT-32": tuple(range(368, 368 + 32 * 1512, 1512)),
-}
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,7 +64,8 @@ class Case:
     @property
     def offset_ns(self) -> I64Array:
         """(channels,) firing of each beam after its block's time."""
-        return np.array(FIRING_NS[self.model], np.int64)
+        table: I64Array = hesai_firing.firing_ns(self.model)[0]
+        return table
 
     @property
     def published(self) -> F64Array:

@@ -1,8 +1,6 @@
 """Firing times of HESAI beams, ns after the time of their block.
 
-Source: docs/sources/hesai.md sections 5 and 12. JT128: HesaiTechnology/HesaiLidar_SDK_2.0
-`correction/firetime_correction`. Pandar20: HesaiTechnology/HesaiLidar_General_SDK
-`pandarGeneral_internal.cc`, -3620 - 1304 a - 1968 b ns with whole numbers a and b of each channel.
+Source: docs/sources/hesai.md sections 5 and 12.
 
 Tables are (channels,) int64 in packet order, as in the vendor's firing-time files and manuals:
 those of Pandar20, Pandar40P and Pandar64 count back from the block's end and are negative (`P20A`,
@@ -192,22 +190,6 @@ _E128_STANDARD = """
 28554 2781 2781 4436 31864 28554 30209 6091 4436 30209 28554 31864 6091 33869 33869 31864
 776 4436 31864 2781 30209 33869 776 28554 4436 6091 33869 30209 2781 776 6091 28554
 """
-_E128_NEAR_HIGH = """
-1:5201 3:1541 18:7206 21:3196 40:27056 75:23201 90:3676 105:5681
-/
-6:4026 9:7206 15:3546 26:12126 47:27406 102:2021 111:7686 120:1541
-/
-12:7336 33:14061 54:27056 93:6856 96:2021 99:3546 114:5201 126:1541
-/
-24:4851 61:26706 68:11426 82:25136 108:5331 117:3196 123:6856 128:1541
-"""
-_E128_NEAR_STANDARD = """
-1:5201 3:1541 6:31804 9:34984 15:31324 18:7206 21:3196 26:39904
-    40:27056 47:55184 75:23201 90:3676 102:29799 105:5681 111:35464 120:29319
-/
-12:7336 24:32629 33:14061 54:27056 61:54484 68:39204 82:52914 93:6856
-    96:2021 99:3546 108:33109 114:5201 117:30974 123:34634 126:1541 128:29319
-"""
 
 
 def _tables(text: str, channels: int) -> I64Array:
@@ -222,17 +204,6 @@ def _by_state(modes: Mapping[str, tuple[I64Array, ...]]) -> dict[tuple[str, int]
     return {
         (mode, state): table for mode, tables in modes.items() for state, table in enumerate(tables)
     }
-
-
-def _near(far: I64Array, text: str) -> I64Array:
-    """Tables `far` (T, 128) with the changes of a text, `channel:ns`, channels from 1."""
-    near: I64Array = far.copy()
-    for table, changes in zip(near, text.split("/"), strict=True):
-        for change in changes.split():
-            channel, firing_ns = change.split(":")
-            table[int(channel) - 1] = int(firing_ns)
-    near.setflags(write=False)
-    return near
 
 
 def _even(first_ns: int, step_ns: int, channels: int, together: int = 1) -> I64Array:
@@ -261,15 +232,7 @@ OT128 = _by_state({HIGH: (*_ot128_high, _ot128_high[1]), STANDARD: tuple(_ot128_
 
 _e128_high = _tables(_E128_HIGH, 128)
 _e128_standard = _tables(_E128_STANDARD, 128)
-_near_standard = tuple(_near(_e128_standard, _E128_NEAR_STANDARD))
-# Pandar128E3X; the near-field times apply below 2.85 m, where few channels differ.
+# Pandar128E3X, far field; below 2.85 m some channels fire at other times (section 12).
 E128 = _by_state(
     {HIGH: tuple(_e128_high), STANDARD: tuple(_e128_standard), SAVING: tuple(_e128_standard)}
-)
-E128_NEAR = _by_state(
-    {
-        HIGH: tuple(_near(_e128_high, _E128_NEAR_HIGH)),
-        STANDARD: _near_standard,
-        SAVING: _near_standard,
-    }
 )

@@ -3,7 +3,7 @@
 Source: docs/sources/hesai.md sections 2 (layout), 3 (tails), 5 (times), 6 (optical centres), 8
 (JT16) and 12; the vertical fields of view are those of the data sheets. The Pandar128E3X fires a
 few of its channels at other times at targets nearer than 2.85 m; the times of the far field are
-used for all (up to 55 us apart, `firing.E128_NEAR`). Pandar20A and B:
+used for all (up to 55 us apart). Pandar20A and B:
 HesaiTechnology/HesaiLidar_General_SDK. Its versions have one of two tables of elevations; each is
 assigned to the model whose beams fire at the times of a Pandar40P at these elevations.
 """

@@ -1,0 +1,1 @@
+"""What the documents say, as numbers that share nothing with the package."""
