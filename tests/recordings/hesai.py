@@ -10,7 +10,7 @@ import numpy as np
 from mlbatch.arrays import F64Array, I64Array
 from tests.recordings import RECORDINGS
 from tests.recordings.references import read_pcd, xyz_of
-from tests.reference import hesai_firing
+from tests.reference import hesai as reference
 
 FOLDER = RECORDINGS / "hesai"
 DUAL = "dual return, last and strongest"
@@ -64,7 +64,7 @@ class Case:
     @property
     def offset_ns(self) -> I64Array:
         """(channels,) firing of each beam after its block's time."""
-        table: I64Array = hesai_firing.firing_ns(self.model)[0]
+        table: I64Array = reference.firing_ns(self.model)[0]
         return table
 
     @property

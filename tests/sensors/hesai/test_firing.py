@@ -1,4 +1,4 @@
-"""Firing tables of models and of the encoder, number by number, and laws that they keep."""
+"""Firing tables and optical centres of models and of the encoder: the document, and laws."""
 
 from __future__ import annotations
 
@@ -11,20 +11,21 @@ from mlbatch.arrays import I64Array
 from mlbatch.sensors.hesai import encode_models, firing
 from mlbatch.sensors.hesai.firing import HIGH, NEVER, OT128, SAVING, STANDARD
 from mlbatch.sensors.hesai.models import ALL, AZIMUTH_STATES, OPERATIONS
-from tests.reference import hesai_firing
+from tests.reference import hesai as reference
 
 FAMILIES = {"Pandar128E3X": "128E3X", "OT128": "OT128"}
 MODELS = {model.name: model for model in ALL}
+WITHOUT_CENTRE = ("Pandar20A", "Pandar20B", "AT128")
 
 
 @pytest.mark.parametrize("name", [name for name in MODELS if name not in FAMILIES])
 def test_a_model_fires_as_the_document_says(name: str) -> None:
-    np.testing.assert_array_equal(MODELS[name].firing_ns, hesai_firing.firing_ns(name))
+    np.testing.assert_array_equal(MODELS[name].firing_ns, reference.firing_ns(name))
 
 
 @pytest.mark.parametrize("name", FAMILIES)
 def test_modes_and_states_choose_the_table_of_the_document(name: str) -> None:
-    wanted = hesai_firing.by_state(FAMILIES[name])
+    wanted = reference.by_state(FAMILIES[name])
     assert len(wanted) == OPERATIONS * AZIMUTH_STATES
     for key, times in wanted.items():
         table = MODELS[name].firing_ns[MODELS[name].tables[key]]
@@ -33,16 +34,27 @@ def test_modes_and_states_choose_the_table_of_the_document(name: str) -> None:
 
 @pytest.mark.parametrize("name", encode_models.TABLES)
 def test_the_encoder_fires_as_the_document_says(name: str) -> None:
-    wanted = hesai_firing.firing_ns(name.removesuffix("-7"))
+    wanted = reference.firing_ns(name.removesuffix("-7"))
     np.testing.assert_array_equal(np.atleast_2d(encode_models.TABLES[name]), wanted)
 
 
 @pytest.mark.parametrize("name", FAMILIES)
 def test_the_encoder_has_the_states_of_the_document(name: str) -> None:
-    wanted = hesai_firing.by_state(FAMILIES[name])
+    wanted = reference.by_state(FAMILIES[name])
     for (mode, state), times in encode_models.STATES[name].items():
         operation = encode_models.OPERATIONS[mode]
         np.testing.assert_array_equal(times, wanted[operation, state], f"{mode} {state}")
+
+
+@pytest.mark.parametrize("name", [name for name in MODELS if name not in WITHOUT_CENTRE])
+def test_optical_centres_are_those_of_the_document(name: str) -> None:
+    wanted = reference.optical_centre_mm(name)
+    # That of a JT16 is rotated: the page has it to a micrometre.
+    assert MODELS[name].centre_mm == pytest.approx(wanted, abs=0.0006 if name == "JT16" else 0)
+
+
+def test_models_without_a_known_optical_centre_have_none() -> None:
+    assert {MODELS[name].centre_mm for name in WITHOUT_CENTRE} == {(0.0, 0.0, 0.0)}
 
 
 def test_tables_are_on_the_side_of_the_block_time_that_the_manual_states() -> None:

@@ -1,7 +1,7 @@
-"""Firing times of HESAI beams, read from docs/sources/hesai.md sections 5 and 12.
+"""Firing times and optical centres of HESAI lidars, read from docs/sources/hesai.md.
 
-The page quotes files of the vendor's SDK and manuals. Tables are (channels,) int64 in ns after the
-time of a block, by the title that the page gives them.
+The page quotes files of the vendor's SDK and manuals (sections 5, 6 and 12). Times are in ns after
+the time of a block.
 """
 
 from __future__ import annotations
@@ -37,6 +37,19 @@ _TITLES = {
     "AT128": ("AT128",),
     "JT128": ("JT128",),
 }
+_CENTRES = {
+    "Pandar40P": "40P",
+    "Pandar40M": "40P",
+    "Pandar64": "64",
+    "PandarQT64": "QT64",
+    "QT128C2X": "QT128",
+    "PandarXT-16": "XT",
+    "PandarXT-32": "XT",
+    "XT32M2X": "XT32M2X",
+    "Pandar128E3X": "128E3X",
+    "OT128": "OT128",
+    "JT128": "JT128",
+}
 # Section 5; no firing times of a JT16 are known.
 _FORMULAS = {
     "PandarXT-16": [368 + 3024 * (channel - 1) for channel in range(1, 17)],
@@ -68,6 +81,18 @@ def by_state(family: str) -> dict[tuple[int, int], I64Array]:
         for state in range(4):
             found[operation, state] = tables[sorted(states)[state % len(states)]]
     return found
+
+
+def optical_centre_mm(model: str) -> tuple[float, ...]:
+    """x to the right, y forward, z up, by section 6; of a JT16 as the SDK rotates it."""
+    text = PAGE.read_text(encoding="utf-8").partition("c in mm (x, y, z): ")[2].partition("\n")[0]
+    if model == "JT16":
+        numbers = text.partition("190 deg, to (")[2].partition(")")[0]
+    else:
+        found = re.findall(r"([\w, ]+?) \(([-\d., ]+)\)", text)
+        by_name = {name.strip(): row for names, row in found for name in names.split(",")}
+        numbers = by_name[_CENTRES[model]]
+    return tuple(map(float, numbers.split(",")))
 
 
 @lru_cache(maxsize=1)
