@@ -3,7 +3,7 @@
 #   make demo    convert the recording in fixtures/two_lidars and draw a scan of it
 #   make test    formatting, lint, types, all tests
 #   make coverage   all tests with branch coverage, at least 95 %
-#   make test-quick   the tests of daily work, within a minute
+#   make test-quick   the fast tests, without whole suites of cases
 #   make test-lowest   the same with the oldest dependencies allowed, by Python 3.10 or 3.11
 #   make lint    the first three of them
 #   make docs    the documentation as a site, build/site/index.html

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import gc
 from collections.abc import Iterator
-from functools import cache
 from pathlib import Path
 
 import pytest
@@ -16,24 +15,51 @@ from tests.builders.sessions import Shell
 settings.register_profile("mlbatch", deadline=None, suppress_health_check=[HealthCheck.too_slow])
 settings.load_profile("mlbatch")
 
-# Whole suites of cases, a folder or a file each: `make test-quick` leaves them out.
+# Whole suites of cases: folders, files and tests that take seconds. `make test-quick` leaves them
+# out; who works on their subject names them: `pytest tests/verify`.
 LONG = (
-    "batch/test_batch.py",
-    "batch/test_dask.py",
-    "batch/test_remote.py",
-    "batch/test_snakemake.py",
+    "batch/",
     "bench/",
     "digest/",
+    "entry_points/",
     "fuzz/",
     "golden/",
     "matrix/",
     "property/",
+    "python/",
     "recordings/",
+    "simulate/",
+    "verify/",
     "batching/test_reference.py",
     "cli/test_bench.py",
+    "cli/test_deskew.py",
+    "cli/test_fusion.py",
+    "cli/test_progress.py",
+    "cli/test_shards.py",
+    "clocks/test_align.py::test_memory",
     "clocks/test_simulated.py",
     "contract/test_models.py",
-    "simulate/test_every_model.py",
+    "contract/test_start.py",
+    "decode/test_decoder.py::test_scans_do_not_depend_on_tiles",
+    "decode/test_native_engine.py::test_any_pixels",
+    "decode/test_native_engine.py::test_upright_sensors",
+    "decode/test_native_headers.py::test_of_damaged_packets",
+    "decode/test_packet_ring.py::test_needed_records",
+    "discovery/test_interleaved.py",
+    "discovery/test_overlap.py",
+    "discovery/test_router.py::test_packets_are_assigned",
+    "outputs/test_read.py",
+    "page/test_windows.py::test_long_runs",
+    "pipeline/test_resume.py",
+    "readers/capture/test_fragments.py::test_the_fast_ways",
+    "readers/test_buffer_ends.py",
+    "rig/test_extrinsics_files.py::test_any_text",
+    "sensors/test_vendors.py",
+    "writers/test_bag_writer.py",
+    "writers/test_durable.py",
+    "writers/test_formats.py",
+    "writers/test_mcap_container.py",
+    "writers/test_message_writer.py",
 )
 
 
@@ -53,11 +79,9 @@ def pytest_collection() -> Iterator[None]:
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Mark the tests of long suites."""
-    here = Path(__file__).parent
-    # Paths of ten thousand tests take a second.
-    is_long = cache(lambda path: path.relative_to(here).as_posix().startswith(LONG))
+    long = tuple(f"tests/{entry}" for entry in LONG)
     for item in items:
-        if is_long(item.path):
+        if item.nodeid.startswith(long):
             item.add_marker(pytest.mark.long)
 
 
