@@ -31,6 +31,7 @@ ADOPTED = {
     "SECURITY.md": "security.md",
 }
 _LINK = re.compile(r"(!?)\[([^\]]*)\]\(([^)\s#:]+)(#[^)\s]*)?\)")
+_CODE = re.compile(r"`[^`\n]+`")
 _ROW = re.compile(r"^\| `(\w+)` \| (.+) \|$", re.MULTILINE)
 
 
@@ -148,11 +149,17 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
 def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Files) -> str:
     """Remove links to files outside the site; give every row of a code its anchor."""
     path = page.file.src_uri
-    if path in made_pages():
-        return markdown
-    folder = (DOCS / path).parent
-    markdown = _relinked(markdown, folder, folder)
-    return anchored(markdown) if path == "report.md" else markdown
+    if path not in made_pages():
+        folder = (DOCS / path).parent
+        markdown = _relinked(markdown, folder, folder)
+    if path == "report.md":
+        markdown = anchored(markdown)
+    return with_plain_bars(markdown)
+
+
+def with_plain_bars(markdown: str) -> str:
+    """Return a page whose table cells have `a|b` for the `a\\|b` that Git hosts need in code."""
+    return _CODE.sub(lambda found: found[0].replace("\\|", "|"), markdown)
 
 
 def anchored(markdown: str) -> str:
