@@ -16,6 +16,7 @@ SPEAKERS = ("print", "exit", "quit", "sys.exit", "os._exit", "typer.echo", "type
 STREAMS = ("sys.stdout", "sys.stderr")
 # What a plug-in's docstring names: a specification, a manual, or the page of facts.
 SOURCE = re.compile(r"docs/sources/\w+\.md|RFC \d+|draft-[\w-]+|APPNOTE|Source: ")
+DOTTED = re.compile(r"`([A-Z]\w+)\.([a-z]\w*)")
 
 Function = ast.FunctionDef | ast.AsyncFunctionDef
 
@@ -53,6 +54,31 @@ def _public(node: ast.Module | ast.ClassDef) -> Iterator[Function | ast.ClassDef
             yield inner
             if isinstance(inner, ast.ClassDef):
                 yield from _public(inner)
+
+
+def test_comments_name_attributes_that_are_there() -> None:
+    """`Class.attribute` of the package in comments, docstrings and pages."""
+    known: dict[str, set[str]] = {}
+    for module in MODULES:
+        for node in ast.walk(module.tree):
+            if isinstance(node, ast.ClassDef):
+                known.setdefault(node.name, set()).update(_attributes(node))
+    pages = [*(ROOT / "docs").rglob("*.md"), ROOT / "README.md", ROOT / "CONTRIBUTING.md"]
+    for path in [*(module.path for module in MODULES), *pages]:
+        for name, attribute in DOTTED.findall(path.read_text(encoding="utf-8")):
+            assert attribute in known.get(name, {attribute}), f"{path}: {name}.{attribute}"
+
+
+def _attributes(node: ast.ClassDef) -> Iterator[str]:
+    """Methods, fields and what methods set."""
+    for inner in ast.walk(node):
+        if isinstance(inner, Function):
+            yield inner.name
+        elif isinstance(inner, ast.AnnAssign | ast.Assign):
+            targets = [inner.target] if isinstance(inner, ast.AnnAssign) else inner.targets
+            yield from (ast.unparse(target).removeprefix("self.") for target in targets)
+        elif isinstance(inner, ast.Constant) and isinstance(inner.value, str):
+            yield inner.value  # A field of a ctypes structure.
 
 
 @pytest.mark.parametrize("plugin", plugins(), ids=_by_name)

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
 
 from mlbatch import writers
 from mlbatch.discovery.discover import SensorSelection
@@ -199,6 +200,37 @@ def test_the_page_of_options_has_every_option() -> None:
         section = page.partition(f"## mlbatch {name}\n")[2].partition("\n## ")[0]
         names = " ".join(row[0] for row in _rows(section))
         assert set(re.findall(r"(?<![\w-])--[\w-]+", names)) >= set(options), name
+
+
+def test_tables_of_the_site_show_bars_in_code() -> None:
+    """Git hosts need `a\\|b` in a cell; the renderer of the site would show the backslash."""
+    site = runpy.run_path(str(ROOT / "docs" / "site_pages.py"))
+    page = site["with_plain_bars"](site["options_page"]())
+    assert "`--batching-times [common|own]`" in page
+    assert "\\|" not in page
+
+
+def test_the_site_needs_no_server_and_no_other_site() -> None:
+    """Its search neither: the script that `offline` would load from unpkg.com is one of ours."""
+    settings = yaml.safe_load((ROOT / "mkdocs.yml").read_text("utf-8"))
+    assert "offline" in settings["plugins"]
+    assert not settings["use_directory_urls"]
+    assert settings["theme"]["font"] is False
+    (script,) = settings["extra"]["polyfills"]
+    assert "iframe-worker" in script
+    assert (ROOT / "docs" / script).is_file()
+
+
+def test_recordings_are_neither_denied_nor_kept_secret() -> None:
+    """A model of a real recording is on the page of comparisons, and in no row without one."""
+    real = {model.name for model in models() if model.verified == "real recording"}
+    accuracy = _page("accuracy.md")
+    for name in real:
+        # All of the recordings of Ouster are in one row.
+        assert name in accuracy or name.startswith("OS"), name
+    denied = [row[0] for row in _rows(_page("sensors.md")) if "no recording" in " ".join(row[1:])]
+    assert denied
+    assert not real & {name for cell in denied for name in cell.split(", ")}
 
 
 def test_every_module_is_on_the_map() -> None:

@@ -39,7 +39,7 @@ def test_every_model_states_how_it_was_verified() -> None:
 def test_the_models_of_ouster() -> None:
     rows = {model.name: model for model in sensors.models() if model.vendor == "Ouster"}
     real = {name for name, model in rows.items() if model.verified == "real recording"}
-    assert real == {"OS0-32", "OS0-128", "OS1-32", "OS1-64", "OS1-128", "OS2-128"}
+    assert real == {"OS0-32", "OS0-128", "OS1-32", "OS1-64", "OS1-128", "OS2-32", "OS2-128"}
     assert rows["OS1-16"].channels == 16
     assert rows["OSDome-128"].returns == (1, 2)
 

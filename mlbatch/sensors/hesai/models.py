@@ -233,7 +233,7 @@ QT128 = Model(
     firing_ns=firing.QT128,
     centre_mm=(7.2, 35.4, 0.0),
     elevation_deg=(-52.6, 52.6),
-    verified="two sources",
+    verified="real recording",
     has_checks=True,
 )
 XT16 = Model(
@@ -261,7 +261,7 @@ XT32M2X = replace(
     firing_ns=firing.XT32M2X[None],
     centre_mm=(-13.0, 30.5, 0.0),
     elevation_deg=(-20.8, 19.5),
-    verified="two sources",
+    verified="real recording",
     most_returns=3,
 )
 _e128_ns, _e128_tables = _by_state(firing.E128)

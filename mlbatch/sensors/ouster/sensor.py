@@ -51,7 +51,7 @@ __all__ = [
 ]
 
 VENDOR = "Ouster"
-_REAL = frozenset({"OS0-32", "OS0-128", "OS1-32", "OS1-64", "OS1-128", "OS2-128"})
+_REAL = frozenset({"OS0-32", "OS0-128", "OS1-32", "OS1-64", "OS1-128", "OS2-32", "OS2-128"})
 _BEAMS = {
     "OS0": (32, 64, 128),
     "OS1": (16, 32, 64, 128),

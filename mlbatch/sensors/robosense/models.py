@@ -276,7 +276,7 @@ HELIOS_32 = Model(
     # 5515, 1615 and 1610.
     spans_deg=((-55.0, 15.0), (-16.0, 15.0), (-16.0, 10.0)),
     modes=_NEW_MODES,
-    verified="two sources",
+    verified="real recording",
 )
 HELIOS_16 = replace(
     HELIOS_32,

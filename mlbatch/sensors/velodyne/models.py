@@ -241,6 +241,7 @@ _VLS_128_DEG = (
 ALPHA_PRIME = Model(
     name="VLS-128", reported_as=VLS_128, lasers=128, units_per_m=250, sequence_ns=55_277, slots=20,
     slot=tuple(laser // 8 + (laser >= 64) for laser in range(128)), banks=4, stamp_ns=-8_700,
+    verified="real recording",
     elevation_deg=_VLS_128_DEG,
     clockwise_deg=(6.354, 4.548, 2.732, 0.911, -0.911, -2.732, -4.548, -6.354) * 16,
     height_mm=_focal(58.63, _VLS_128_DEG),
