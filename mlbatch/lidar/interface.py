@@ -60,8 +60,8 @@ class Evidence(NamedTuple):
     neighbours: tuple[NeighbourStream, ...] = ()
 
 
-# `Calibration.match_score` of packets that can be read with it but name another model: the calibration is
-# used only if the rig names its model.
+# `Calibration.match_score` of packets that can be read with it but name another model: the
+# calibration is used only if the rig names its model.
 NAMED_ONLY = -1
 
 
