@@ -11,6 +11,7 @@ import importlib.util
 import io
 import os
 import re
+import shlex
 import subprocess
 import sys
 from pathlib import Path
@@ -141,8 +142,12 @@ def test_blocks_that_do_not_run_have_options_that_exist(block: Block) -> None:
     for command in block.commands():
         for arguments in calls(command.line, "mlbatch"):
             _parse(arguments)
-        for targets in calls(command.line, "make"):
-            assert set(targets) <= MAKE_TARGETS, f"{block.place}: {command.line}"
+        for words in calls(command.line, "make"):
+            targets = {word for word in words if "=" not in word}
+            assert targets <= MAKE_TARGETS, f"{block.place}: {command.line}"
+            for word in words:
+                if word.startswith("BENCH="):
+                    _parse(["bench", *shlex.split(word.removeprefix("BENCH="))])
 
 
 def _parse(arguments: list[str]) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 import runpy
 from collections.abc import Iterator
@@ -12,6 +13,7 @@ import pytest
 import yaml
 
 from mlbatch import writers
+from mlbatch.bench.cases import CASES, RECORDINGS, disk_bytes
 from mlbatch.discovery.discover import SensorSelection
 from mlbatch.page.findings import REMEDIES
 from mlbatch.pipeline.job import Job
@@ -200,6 +202,20 @@ def test_the_page_of_options_has_every_option() -> None:
         section = page.partition(f"## mlbatch {name}\n")[2].partition("\n## ")[0]
         names = " ".join(row[0] for row in _rows(section))
         assert set(re.findall(r"(?<![\w-])--[\w-]+", names)) >= set(options), name
+
+
+def test_the_figures_of_performance_have_cases_that_print_them() -> None:
+    """The cases of the table are those of `mlbatch bench`, the recordings as well."""
+    page = _page("performance.md")
+    again = page.partition("\n## Measure again\n")[2].partition("\n## ")[0]
+    named = {word for row in _rows(again) for word in re.split(r"[ ,()]+", row[0])}
+    assert {case.name for case in CASES} - named <= {"pandar64", "mixed", "mixed-mcap"}
+    # Upper limits, as `mlbatch bench` asks for them.
+    gigabytes = dict(re.findall(r"(12 s need|else running and) (\d+) GB of free disk", page))
+    assert int(gigabytes["12 s need"]) == math.ceil(disk_bytes(CASES, 12) / 1e9)
+    assert int(gigabytes["else running and"]) >= disk_bytes(CASES, 60) / 1e9
+    listed = page.partition("\n## Recordings\n")[2].partition("\n## ")[0]
+    assert set(RECORDINGS) <= _first_cells(listed)
 
 
 def test_tables_of_the_site_show_bars_in_code() -> None:
