@@ -14,14 +14,22 @@ import yaml
 
 from mlbatch import writers
 from mlbatch.bench.cases import CASES, RECORDINGS, disk_bytes
+from mlbatch.discovery import sampler
 from mlbatch.discovery.discover import SensorSelection
+from mlbatch.discovery.probe import MAX_CALIBRATION_FILE_BYTES
+from mlbatch.frames import urdf
+from mlbatch.lidar import limits as lidar_limits
 from mlbatch.page.findings import REMEDIES
 from mlbatch.pipeline.job import Job
 from mlbatch.pipeline.run import convert
-from mlbatch.readers import readers
+from mlbatch.readers import readers, source
+from mlbatch.readers.bag import recording as bag_recording
+from mlbatch.readers.bag.packet_messages import PACKET_TYPES
+from mlbatch.readers.capture import recording as capture
 from mlbatch.report import ledger
 from mlbatch.report.report import build_report
-from mlbatch.sensors import models
+from mlbatch.rig import yaml_tree
+from mlbatch.sensors import MAX_CALIBRATION_BYTES, models
 from mlbatch.writers import format_names, formats
 from mlbatch.writers.point_layouts import CLOUD_LAYOUTS, PLY_LAYOUT
 from tests.consumers.environments import ENVIRONMENTS
@@ -216,6 +224,43 @@ def test_the_figures_of_performance_have_cases_that_print_them() -> None:
     assert int(gigabytes["else running and"]) >= disk_bytes(CASES, 60) / 1e9
     listed = page.partition("\n## Recordings\n")[2].partition("\n## ")[0]
     assert set(RECORDINGS) <= _first_cells(listed)
+
+
+def test_packet_messages_are_counted_as_listed() -> None:
+    kinds = [row for row in _rows(_page("recordings.md")) if row[0] in PACKET_TYPES]
+    recorded = [row for row in kinds if row[3].startswith("recorded bag")]
+    assert len(kinds) == len(PACKET_TYPES)
+    counts = f"Of {len(kinds)} packet message types {len(recorded)} were checked"
+    assert counts in _page("limits.md")
+
+
+@pytest.mark.parametrize(
+    ("text", "bounds"),
+    [
+        ("256 kB, 1 MB", (capture.MAX_FRAME_BYTES >> 10, capture.MAX_BLOCK_BYTES >> 20)),
+        ("256 MB, independent", (source.MAX_RECORD_BYTES >> 20,)),
+        (
+            "300 kB, 20,000 values, 16 levels",
+            (yaml_tree.MAX_BYTES // 1000, yaml_tree.MAX_VALUES, yaml_tree.MAX_DEPTH),
+        ),
+        ("16 MB, no document types", (urdf.MAX_BYTES >> 20,)),
+        ("2 MB, 16 MB; NaN", (MAX_CALIBRATION_FILE_BYTES // 10**6, MAX_CALIBRATION_BYTES // 10**6)),
+        ("| 64 of its own source", (sampler.MAX_NEIGHBOURS,)),
+        ("| notes on one file | 100 |", (bag_recording.MOST_NOTES,)),
+        (
+            "rigid, finite, at most 1 m; beams leave within 0.5 m",
+            (lidar_limits.MAX_ORIGIN_M, lidar_limits.MAX_BEAM_M),
+        ),
+        ("rigid, finite, at most 100 m", (lidar_limits.MAX_POSE_M,)),
+        ("at most 10 km from the body", (lidar_limits.MAX_TRANSLATION_M / 1000,)),
+    ],
+)
+def test_bounds_of_untrusted_input_are_those_of_the_code(
+    text: str, bounds: tuple[float, ...]
+) -> None:
+    assert text in _page("untrusted.md")
+    numbers = [float(word.replace(",", "")) for word in re.findall(r"\d[\d,.]*\d|\d", text)]
+    assert numbers == list(bounds)
 
 
 def test_tables_of_the_site_show_bars_in_code() -> None:
