@@ -13,13 +13,13 @@ from mlbatch.lidar.interface import NAMED_ONLY, Evidence, ModelFile, NeighbourSt
 from mlbatch.sensors import models
 from mlbatch.sensors.robosense import sensor as robosense
 from mlbatch.sensors.robosense.difop import Angles, find_difop
-from mlbatch.sensors.robosense.models import AIRY_96, BPEARL_V4, RS16, RS32, Model
+from mlbatch.sensors.robosense.models import AIRY_96, BPEARL_V4, ROWS, RS16, RS32, Model
 from mlbatch.types import Stream
 from tests.builders.others import filled, rows
 from tests.builders.robosense import RobosenseSpec, angles_csv, difop, fan, msop
 from tests.builders.robosense_decoded import DIFOP, built_in, decoded, evidence_of
 from tests.builders.robosense_models import DUAL, LAST, STRONGEST
-from tests.contract.tree import ROOT
+from tests.reference import robosense as reference
 
 MAGIC, TAIL = bytes.fromhex("a5ff005a11115555"), b"\x0f\xf0"
 
@@ -156,9 +156,26 @@ def test_a_bpearl_v4_has_nominal_angles() -> None:
     assert len(lidar.notes) == 1
     assert "nominal" in lidar.notes[0]
     rise = np.degrees(np.arcsin(lidar.beams.direction[2, :, 2]))
-    page = (ROOT / "docs" / "sources" / "robosense.md").read_text(encoding="utf-8")
-    wanted = page.partition("Bpearl v4 in deg: ")[2].partition(";")[0].split()
-    assert rise == pytest.approx([float(word) for word in wanted], abs=1e-4)
+    assert rise == pytest.approx(reference.bpearl_v4_elevation_deg(), abs=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("family", "names"),
+    [
+        ("RS-16, RS-32, Bpearl v3", ("RS-LiDAR-16", "RS-LiDAR-32", "RS-Bpearl v3")),
+        ("Bpearl v4, Helios", ("RS-Bpearl v4", "Helios 16", "Helios 32")),
+        ("Ruby (old)", ("Ruby 48", "Ruby 80", "Ruby 128")),
+        ("Ruby Plus", ("Ruby Plus 48", "Ruby Plus 80", "Ruby Plus 128")),
+        ("Airy", ("Airy 48", "Airy 96")),
+    ],
+)
+def test_return_modes_are_those_of_the_document(family: str, names: tuple[str, ...]) -> None:
+    wanted = reference.return_modes(family)
+    for row in (row for row in ROWS if row.name in names):
+        found = {code: mode.name or reference.DUAL for code, mode in row.modes.items()}
+        assert found == wanted
+        assert {mode.returns for mode in row.modes.values() if not mode.name} <= {2}
+    assert set(names) <= {row.name for row in ROWS}
 
 
 def test_a_sensor_that_is_silent_cannot_be_made() -> None:
