@@ -7,7 +7,7 @@
 #   make test-lowest   the same with the oldest dependencies allowed, by Python 3.10 or 3.11
 #   make lint    the first three of them
 #   make docs    the documentation as a site, build/site/index.html
-#   make bench   how fast it is here, in 15 minutes (BENCH="--case dual-4 --peer-python PYTHON")
+#   make bench   how fast it is here (BENCH="--case dual-4 --peer-python PYTHON")
 #   make test-consumers   programs of others read our outputs, each in an environment of its own
 #   make odometry   KISS-ICP on windows and on fused sweeps, on simulated rigs (docs/odometry.md)
 #   make casestudy   lidar-inertial odometry of one and two lidars (docs/casestudy.md)
