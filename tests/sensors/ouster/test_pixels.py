@@ -13,10 +13,11 @@ from hypothesis import strategies as st
 
 from mlbatch.arrays import U8Array
 from mlbatch.sensors.ouster.pixels import PixelReader
-from mlbatch.sensors.ouster.profiles import PROFILES, PacketLayout
+from mlbatch.sensors.ouster.profiles import HEADER_TYPES, HEADERS, OFF, PROFILES, PacketLayout
 from mlbatch.sensors.ouster.sensor import OusterLidar, read_calibration
 from mlbatch.types import Pixels
 from tests.builders.ouster import IntLike, OusterSpec, encode_packets, metadata_json
+from tests.reference import ouster as reference
 
 # One pixel a profile, worked by hand from the sheet. Words that occur again and again:
 # d2 84: raw range 1234 (04d2) with the flag bit above it; 5a: reflectivity 90; 33: near IR.
@@ -90,6 +91,23 @@ def blank(shape: tuple[int, int]) -> Pixels:
 
 def test_all_profiles_are_checked_by_hand() -> None:
     assert set(BY_HAND) == set(NAMES) == set(SIZES)
+
+
+def test_every_field_of_a_pixel_is_where_the_document_has_it() -> None:
+    """Those that are not decoded, too: the encoder takes them from the same table."""
+    found = {
+        name: (profile.pixel_size, {field: tuple(at) for field, at in profile.fields.items()})
+        for name, profile in PROFILES.items()
+        if name != OFF
+    }
+    assert found == reference.pixels()
+
+
+@pytest.mark.parametrize("kind", HEADER_TYPES)
+def test_fields_of_headers_are_where_the_document_has_them(kind: str) -> None:
+    wanted = reference.header_fields(kind)
+    names = ("packet type", "frame id", "init id", "serial number", "alert flags")
+    assert tuple(HEADERS[kind]) == tuple(wanted[name] for name in names)
 
 
 @pytest.mark.parametrize("name", NAMES)
