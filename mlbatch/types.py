@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, NamedTuple, TypeAlias
 import numpy as np
 
 from mlbatch.arrays import BoolArray, F32Array, F64Array, I64Array, U8Array, U16Array, U32Array
+from mlbatch.units import NS_PER_MS
 
 if TYPE_CHECKING:
     from mlbatch.native.arena import PacketArena
@@ -143,9 +144,18 @@ class CaptureCounts:
     skipped: dict[str, int] = field(default_factory=dict)  # by reason
 
     def skip(self, reason: str, count: int = 1) -> None:
-        """Count frames without a datagram; reasons: `ledger.CAPTURE_REASONS`."""
-        if count:
-            self.skipped[reason] = self.skipped.get(reason, 0) + count
+        """Count frames without a datagram; reasons: `ledger.CAPTURE_REASONS`.
+
+        Less than 0: frames of a datagram that another capture completed.
+        """
+        total = self.skipped.pop(reason, 0) + count
+        if total:
+            self.skipped[reason] = total
+
+
+# A capture may begin so much before the end of the one that it continues: receive times step back
+# where several queues are captured.
+MAX_OVERLAP_NS = 10 * NS_PER_MS
 
 
 class CutOff(str):
@@ -192,6 +202,17 @@ class Recording:
         """
         return None
 
+    @property
+    def fragments_begin_ns(self) -> int | None:
+        """Receive time of the first frame of the newest pass, if it left datagrams open."""
+        return None
+
+    def follow(self, earlier: Recording) -> None:
+        """Begin the next pass with the fragments that `earlier` left open, if it continues that.
+
+        earlier: was read to its end; this one: at least its first packets were read.
+        """
+
     def use_engine(self, engine: str) -> None:
         """Read by `numpy` or `native` from the next pass on."""
         self.engine = engine
@@ -217,6 +238,15 @@ class WrappedRecording(Recording):
     def __getattr__(self, name: str) -> object:
         """Called for slots without a value."""
         return getattr(self.inner, name)
+
+    @property
+    def fragments_begin_ns(self) -> int | None:
+        """Pass the time on."""
+        return self.inner.fragments_begin_ns
+
+    def follow(self, earlier: Recording) -> None:
+        """Pass on what both wrap."""
+        self.inner.follow(earlier.inner if isinstance(earlier, WrappedRecording) else earlier)
 
     def use_engine(self, engine: str) -> None:
         """Pass the engine on."""

@@ -4,19 +4,24 @@ Equal times keep the order of the recordings. Where a recording's own times step
 keep their order and count with the largest time so far. A recording of messages alone is read
 first, so that its metadata are known before any packet, or by its log times, so that memory needs
 to contain little of it.
+
+Captures that follow each other (tcpdump -C, -G) are read as the one capture that they were: each
+takes over the fragments of datagrams that the one before left open.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Generator, Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import takewhile
+from pathlib import Path
 from typing import TypeAlias
 
 import numpy as np
 
 from mlbatch.arrays import I64Array, U8Array
 from mlbatch.readers.byte_records import SLACK, copy_runs
-from mlbatch.types import PacketBatch, Recording
+from mlbatch.types import MAX_OVERLAP_NS, PacketBatch, Recording
 
 # Called with the next packets of a recording, before they are merged; None: it has no more.
 Seen: TypeAlias = Callable[[Recording, "PacketBatch | None"], None]
@@ -73,9 +78,32 @@ def _merged(feeds: list[_Feed], seen: Seen | None) -> Iterator[PacketBatch]:
             yield replace(batch, messages=messages)
         elif messages:
             yield replace(_NOTHING, messages=messages)
+        if slowest.is_unopened:
+            _take_over(slowest, feeds)
         slowest.advance()
         if slowest.ended and seen is not None:
             seen(slowest.recording, None)
+
+
+def _take_over(feed: _Feed, feeds: list[_Feed]) -> None:
+    """Let a capture that is opened next continue those that it follows."""
+    begin_ns = feed.recording.fragments_begin_ns
+    if begin_ns is None:
+        return
+    others = [other for other in feeds if other.recording.fragments_begin_ns is not None]
+    for other in others:
+        other.read_ahead(begin_ns + MAX_OVERLAP_NS)
+    # Of several with fragments of the same datagram the one whose name is most alike.
+    others.sort(key=lambda other: -_alike(other.recording.path, feed.recording.path))
+    for other in others:
+        if other.is_read:
+            feed.recording.follow(other.recording)
+
+
+def _alike(first: Path, second: Path) -> int:
+    """Number of characters with which both paths begin."""
+    pairs = zip(str(first), str(second), strict=False)
+    return sum(1 for _ in takewhile(lambda pair: pair[0] == pair[1], pairs))
 
 
 @dataclass(slots=True)
@@ -83,13 +111,14 @@ class _Feed:
     """Packets of one recording that are known and not yet given out.
 
     key_ns: (n,) largest receive time up to each packet of `batch`; known_until_ns: no later packet
-    of this recording can come before it.
+    of this recording can come before it; is_read: there is no further batch.
     """
 
     recording: Recording
     by_log_time: bool
     known_until_ns: int = 0
     ended: bool = False
+    is_read: bool = False
     batch: PacketBatch | None = None
     key_ns: I64Array = field(default_factory=lambda: _NONE)
     _packets: Generator[PacketBatch, None, None] | None = None
@@ -101,10 +130,13 @@ class _Feed:
         first = next((batch for batch in packets if len(batch) or batch.messages), None)
         # Closing now returns the buffer.
         packets.close()
+        # The first datagram may begin in another recording.
+        begin_ns = recording.fragments_begin_ns
         if first is None:
-            return cls(recording, by_log_time, ended=True)
+            return cls(recording, by_log_time, begin_ns or 0, ended=begin_ns is None)
         if len(first):
-            known_until_ns = int(first.host_ns[0])
+            first_ns = int(first.host_ns[0])
+            known_until_ns = first_ns if begin_ns is None else min(first_ns, begin_ns)
         else:
             # Log times of messages are no clock for the packets of others unless `by_log_time`.
             known_until_ns = first.messages[0].host_ns if by_log_time else 0
@@ -122,23 +154,48 @@ class _Feed:
         self.key_ns = self.key_ns[stop:]
         return given, key_ns
 
+    @property
+    def is_unopened(self) -> bool:
+        """True before the first `advance`."""
+        return self._packets is None and not self.is_read
+
     def advance(self) -> None:
         """Get the next batch; its bytes replace those of the one before."""
-        if self._packets is None:
+        self.batch = self._next()
+        self.ended = self.batch is None
+
+    def read_ahead(self, until_ns: int) -> None:
+        """Read a capture that is open to this time or its end; keep what was not given out."""
+        while self._packets is not None and self.known_until_ns <= until_ns:
+            kept = []
+            if self.batch is not None and len(self.batch):
+                # The next batch replaces the bytes.
+                copied, _ = _interleave([(self.batch, self.key_ns)], _NOTHING.data)
+                kept = [(copied, self.key_ns)]
+            batch = self._next()
+            if batch is not None:
+                kept.append((batch, self.key_ns))
+            if kept:
+                self.batch, _ = _interleave(kept, _NOTHING.data)
+                self.key_ns = np.concatenate([key_ns for _, key_ns in kept])
+
+    def _next(self) -> PacketBatch | None:
+        """The next batch, whose times are known then; None at the end."""
+        if self.is_unopened:
             self._packets = self.recording.packets()
-        batch = next((batch for batch in self._packets if len(batch) or batch.messages), None)
+        packets = self._packets or ()
+        batch = next((batch for batch in packets if len(batch) or batch.messages), None)
         if batch is None:
-            self.ended = True
-            self.batch = None
+            self.is_read = True
             self._packets = None
-            return
-        self.batch = batch
+            return None
         self.key_ns = np.maximum(np.maximum.accumulate(batch.host_ns), self.known_until_ns)
         if len(batch):
             self.known_until_ns = int(self.key_ns[-1])
         elif self.by_log_time:
             last_ns = max(message.host_ns for message in batch.messages)
             self.known_until_ns = max(self.known_until_ns, last_ns)
+        return batch
 
     def close(self) -> None:
         """End the reading in this thread, not when the last reference is dropped."""

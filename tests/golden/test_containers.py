@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gzip
 import re
 from collections import Counter
 from dataclasses import replace
@@ -13,8 +14,10 @@ from mlbatch.frames.naming import NAMINGS
 from mlbatch.readers import open_recording
 from mlbatch.readers.bag.packet_messages import PACKET_TYPES
 from mlbatch.types import StreamTable
+from tests.builders.captures import Packet, Section, pcap_bytes, write_pcapng
 from tests.builders.run import FIXTURE, RECORDINGS, ROOT, Values, command, in_memory, prints
 from tests.builders.sessions_of_bags import CONTAINERS, edited_copy
+from tests.builders.traffic import read_pcap
 
 # MANIFEST.md: topic, packets, their bytes.
 BAGS = {
@@ -45,6 +48,36 @@ def test_scans_do_not_depend_on_the_container(
 ) -> None:
     path = CONTAINERS[name](tmp_path)
     assert prints(in_memory(replace(FIXTURE, recordings=(path,)))) == of_the_pcap
+
+
+@pytest.mark.parametrize("kind", ["pcap", "pcapng", "gz"])
+@pytest.mark.parametrize("order", ["as recorded", "last first"])
+def test_scans_do_not_depend_on_the_rotation_of_a_capture(
+    kind: str, order: str, of_the_pcap: list[Values], tmp_path: Path
+) -> None:
+    """As tcpdump -C writes it: nine of its borders are within a datagram."""
+    paths = rotated(FIXTURE.recordings[0], tmp_path, kind)
+    job = replace(FIXTURE, recordings=paths if order == "as recorded" else paths[::-1])
+    of_the_files = in_memory(job)
+    assert prints(of_the_files) == of_the_pcap
+    # SOURCE.md: 2074 frames, 714 datagrams.
+    skipped = of_the_files.report.capture.skipped
+    assert skipped == {"not_ip": 3, "not_udp": 2, "fragment": 1355}
+
+
+def rotated(path: Path, folder: Path, kind: str) -> tuple[Path, ...]:
+    """The frames of a capture in files of 180."""
+    records = read_pcap(path)
+    paths = []
+    for number, part in enumerate(records[at : at + 180] for at in range(0, len(records), 180)):
+        target = folder / f"trace.pcap{number or ''}"
+        if kind == "pcapng":
+            write_pcapng(target, [Section([Packet(frame, host_ns) for host_ns, frame in part])])
+        else:
+            data = pcap_bytes(part)
+            target.write_bytes(gzip.compress(data) if kind == "gz" else data)
+        paths.append(target)
+    return tuple(paths)
 
 
 def test_the_page_on_recordings_lists_all_types_and_frames() -> None:

@@ -2,8 +2,10 @@
 
 The rules, in receive order of the fragments:
 - a set is identified by (source, destination, identification); the protocol is always UDP here;
-- a set whose first fragment is more than 1 s before or after any later fragment is dropped:
-  fragments of one datagram arrive within a millisecond, and identifications are used again;
+- a set whose first fragment is more than 1 s older than a later fragment is dropped: fragments of
+  one datagram arrive within a millisecond, and identifications are used again; ages are differences
+  of the largest receive time so far, since times step back where several queues are captured, and
+  a step back by more than 1 s is another clock, which drops all sets;
 - a fragment at offset 0 with other bytes than the one already there begins a new datagram: the old
   set is dropped; a duplicate fragment (same place, same bytes) changes nothing;
 - fragments that overlap otherwise, or are beyond the last one, drop their set;
@@ -11,6 +13,10 @@ The rules, in receive order of the fragments:
 - at most MAX_SETS sets are open: a further one drops the oldest.
 Frames of dropped and never completed sets are counted `fragment_lost`; the frames of a completed
 datagram but the completing one are counted `fragment`, so that each datagram is one frame.
+
+A capture that follows another one (tcpdump -C and -G begin a new file within a datagram) takes over
+the sets that the other left open and that its own first fragments belong to (`SetTable.hand_over`).
+Captures that overlap in time do not follow each other: their fragments never mix.
 
 `SetTable` applies the rules to one fragment at a time. `Reassembler` treats the usual case many at
 once: all fragments of a datagram are in one buffer, in order, and no set of theirs is open. Where
@@ -20,9 +26,9 @@ fragments of one set in which each continues the one before.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -34,6 +40,7 @@ from mlbatch.types import CaptureCounts
 from mlbatch.units import NS_PER_S
 
 MAX_SETS = 2048
+MAX_FIRST_KEYS = 64
 MAX_DATAGRAM_BYTES = 65535
 MAX_AGE_NS = NS_PER_S
 _UDP_BYTES = 8
@@ -42,15 +49,16 @@ _FEW = 64
 
 
 @dataclass(slots=True)
-class _Set:
+class FragmentSet:
     """Fragments of one datagram so far; total: its length, known from the last fragment."""
 
     # Receive time of the first fragment.
     birth_ns: int
     # Data by offset in the datagram.
     parts: dict[int, bytes] = field(default_factory=dict)
-    # Number of frames.
+    # Number of frames of the capture that is read, and of those before it.
     frames: int = 0
+    earlier: list[tuple[CaptureCounts, int]] = field(default_factory=list)
     # Bytes of `parts`.
     received: int = 0
     total: int | None = None
@@ -75,40 +83,53 @@ class _Set:
         return self.received == self.total
 
 
+# Source, destination, identification.
+Key: TypeAlias = tuple[int, int, int]
+
+
 @dataclass(slots=True)
 class SetTable:
-    """The open sets; held_bytes: of their fragments."""
+    """The open sets, oldest first; held_bytes: of their fragments.
+
+    first_keys: the sets that were open first, at most MAX_FIRST_KEYS; now_ns: largest receive time
+    so far.
+    """
 
     counts: CaptureCounts
     held_bytes: int = 0
-    _sets: dict[tuple[int, int, int], _Set] = field(default_factory=dict)
-    _oldest_ns: int = 0
-    _newest_ns: int = 0
+    first_keys: set[Key] = field(default_factory=set)
+    now_ns: int = 0
+    _sets: dict[Key, FragmentSet] = field(default_factory=dict)
 
     def __len__(self) -> int:
         return len(self._sets)
 
-    def __contains__(self, key: tuple[int, int, int]) -> bool:
+    def __contains__(self, key: Key) -> bool:
         return key in self._sets
 
-    def keys(self) -> list[tuple[int, int, int]]:
+    def open_keys(self) -> list[Key]:
         """Source, destination and identification of the open sets."""
         return list(self._sets)
 
-    def expire(self, now_ns: int) -> None:
-        """Drop the sets that are more than a second away from `now_ns`."""
-        if now_ns - self._oldest_ns <= MAX_AGE_NS and self._newest_ns - now_ns <= MAX_AGE_NS:
-            return
-        for key, held in list(self._sets.items()):
-            if abs(now_ns - held.birth_ns) > MAX_AGE_NS:
-                self._drop(key)
-        births = [held.birth_ns for held in self._sets.values()]
-        self._oldest_ns = min(births, default=now_ns)
-        self._newest_ns = max(births, default=now_ns)
+    def running_ns(self, host_ns: I64Array) -> I64Array | None:
+        """Largest receive times so far (n,); None where they are times of another clock."""
+        running: I64Array = np.maximum.accumulate(np.append(self.now_ns, host_ns))[1:]
+        return None if bool((running - host_ns > MAX_AGE_NS).any()) else running
 
-    def add(
-        self, key: tuple[int, int, int], offset: int, part: bytes, more: bool, now_ns: int
-    ) -> dict[int, bytes] | None:
+    def expire(self, host_ns: int) -> None:
+        """Advance the clock; drop the sets that are more than a second old."""
+        if self.now_ns - host_ns > MAX_AGE_NS:
+            for key in list(self._sets):
+                self._drop(key)
+            self.now_ns = host_ns
+        self.now_ns = max(self.now_ns, host_ns)
+        while self._sets:
+            key, oldest = next(iter(self._sets.items()))
+            if self.now_ns - oldest.birth_ns <= MAX_AGE_NS:
+                return
+            self._drop(key)
+
+    def add(self, key: Key, offset: int, part: bytes, more: bool) -> dict[int, bytes] | None:
         """Add a fragment; the parts of the datagram by offset if it is complete."""
         held = self._sets.get(key)
         known = held.parts.get(offset) if held else None
@@ -118,7 +139,7 @@ class SetTable:
         if held and known is not None and offset == 0:
             self._drop(key)
             held = None
-        held = held or self._open(key, now_ns)
+        held = held or self._open(key)
         held.frames += 1
         if not held.fits(offset, len(part), more):
             self._drop(key)
@@ -127,21 +148,40 @@ class SetTable:
         return self._close(key) if held.add(offset, part, more) else None
 
     def finish(self) -> None:
-        """Count the open sets as lost."""
-        for key in list(self._sets):
-            self._drop(key)
+        """Count the open sets as lost, which `hand_over` takes back."""
+        for held in self._sets.values():
+            self._count(held, "fragment_lost", 1)
 
-    def _open(self, key: tuple[int, int, int], now_ns: int) -> _Set:
-        if len(self._sets) >= MAX_SETS:
-            self._drop(next(iter(self._sets)))
-        if not self._sets:
-            self._oldest_ns = self._newest_ns = now_ns
-        self._oldest_ns = min(self._oldest_ns, now_ns)
-        self._newest_ns = max(self._newest_ns, now_ns)
-        held = self._sets[key] = _Set(now_ns)
+    def forget(self) -> None:
+        """Free what no capture follows soon enough for."""
+        self._sets = {}
+        self.held_bytes = 0
+
+    def hand_over(self, key: Key) -> FragmentSet:
+        """Give an open set, after `finish`, to the table of a capture that follows."""
+        held = self._sets.pop(key)
+        self._count(held, "fragment_lost", -1)
+        held.earlier.append((self.counts, held.frames))
+        held.frames = 0
         return held
 
-    def _close(self, key: tuple[int, int, int]) -> dict[int, bytes] | None:
+    def take_over(self, sets: Mapping[Key, FragmentSet], now_ns: int) -> None:
+        """Begin with sets of captures before this one; now_ns: their largest receive time."""
+        by_age = sorted(sets.items(), key=lambda item: item[1].birth_ns)
+        self._sets = dict(by_age)
+        self.first_keys = set(self._sets)
+        self.held_bytes = sum(held.received for held in self._sets.values())
+        self.now_ns = now_ns
+
+    def _open(self, key: Key) -> FragmentSet:
+        if len(self._sets) >= MAX_SETS:
+            self._drop(next(iter(self._sets)))
+        if len(self.first_keys) < MAX_FIRST_KEYS:
+            self.first_keys.add(key)
+        held = self._sets[key] = FragmentSet(self.now_ns)
+        return held
+
+    def _close(self, key: Key) -> dict[int, bytes] | None:
         held = self._sets[key]
         length = int.from_bytes(held.parts[0][4:6], "big")
         if len(held.parts[0]) < _UDP_BYTES or not _UDP_BYTES <= length <= held.received:
@@ -149,13 +189,20 @@ class SetTable:
             return None
         del self._sets[key]
         self.held_bytes -= held.received
-        self.counts.skip("fragment", held.frames - 1)
+        # The completing frame is the datagram's.
+        held.frames -= 1
+        self._count(held, "fragment", 1)
         return held.parts
 
-    def _drop(self, key: tuple[int, int, int]) -> None:
+    def _drop(self, key: Key) -> None:
         held = self._sets.pop(key)
         self.held_bytes -= held.received
-        self.counts.skip("fragment_lost", held.frames)
+        self._count(held, "fragment_lost", 1)
+
+    def _count(self, held: FragmentSet, reason: str, sign: int) -> None:
+        """Count the frames of a set, each for its own capture; sign: -1 to take them back."""
+        for counts, frames in (*held.earlier, (self.counts, held.frames)):
+            counts.skip(reason, sign * frames)
 
 
 # -- many at once ----------------------------------------------------------------------------------
@@ -199,12 +246,16 @@ class Reassembler:
         host_ns: (n,) int64, receive time of each fragment. The caller leaves enough room: the
         fragments' bytes and `sets.held_bytes`, or MAX_DATAGRAM_BYTES for each fragment.
         """
-        if not self.together or not _independent(fragments, host_ns):
+        running_ns = self.sets.running_ns(host_ns)
+        is_ipv4 = bool((fragments.source >= 0).all())
+        if running_ns is None or not (self.together and is_ipv4 and len(fragments)):
             return self._one_by_one(data, fragments, host_ns, _every(fragments), 0)
+        # With times that rise, the last one decides on age.
+        host_ns = running_ns
         if self.loops is None or len(self.sets) >= JOIN_SETS:
             return self._by_chains(data, fragments, host_ns)
         columns = np.array([getattr(fragments, name) for name in Fragments.__slots__], np.int64)
-        joined, rest = self.loops.join(data, columns, host_ns, MAX_AGE_NS, self.sets.keys())
+        joined, rest = self.loops.join(data, columns, host_ns, MAX_AGE_NS, self.sets.open_keys())
         self.counts.skip("fragment", len(fragments) - len(rest) - joined.shape[1])
         if len(rest) < _FEW:
             others = self._one_by_one(data, fragments, host_ns, rest, 0)
@@ -255,9 +306,8 @@ class Reassembler:
             key = (source, int(fragments.destination[row]), int(fragments.ident[row]))
             offset = int(fragments.offset[row])
             more = bool(fragments.more[row])
-            now_ns = int(host_ns[row])
-            self.sets.expire(now_ns)
-            parts = self.sets.add(key, offset, bytes(view[start : start + size]), more, now_ns)
+            self.sets.expire(int(host_ns[row]))
+            parts = self.sets.add(key, offset, bytes(view[start : start + size]), more)
             if parts is None:
                 continue
             for at, part in parts.items():
@@ -271,12 +321,6 @@ class Reassembler:
 
 def _every(fragments: Fragments) -> I64Array:
     return np.arange(len(fragments))
-
-
-def _independent(fragments: Fragments, host_ns: I64Array) -> bool:
-    """Whether receive times rise, so that the last one decides on age, and no source is IPv6."""
-    steps_back = host_ns[1:] < host_ns[:-1]
-    return len(fragments) > 0 and not steps_back.any() and bool((fragments.source >= 0).all())
 
 
 def _find_chains(data: U8Array, fragments: Fragments, host_ns: I64Array) -> _Chains:

@@ -345,6 +345,7 @@ def _columns(rows: Sequence[tuple[int, ...]], width: int) -> I64Array:
 
 # Of a key: source address above, destination port below.
 _PORT_BITS = 16
+_IPV4_BYTES = 4
 
 
 @dataclass(slots=True)
@@ -357,14 +358,20 @@ class Addresses:
     _ipv6: dict[bytes, int] = field(default_factory=dict)
 
     def number(self, packed: bytes) -> int:
-        """Number of an IPv6 address of 16 bytes."""
+        """Number of an address of 4 or 16 bytes."""
+        if len(packed) == _IPV4_BYTES:
+            return int.from_bytes(packed, "big")
         return self._ipv6.setdefault(packed, -1 - len(self._ipv6))
+
+    def packed(self, number: int) -> bytes:
+        """The 4 or 16 bytes of an address."""
+        if number >= 0:
+            return number.to_bytes(_IPV4_BYTES, "big")
+        return list(self._ipv6)[-1 - number]
 
     def text(self, number: int) -> str:
         """The usual notation of an address."""
-        if number >= 0:
-            return str(ipaddress.IPv4Address(number))
-        return str(ipaddress.IPv6Address(list(self._ipv6)[-1 - number]))
+        return str(ipaddress.ip_address(self.packed(number)))
 
 
 @dataclass(slots=True)

@@ -8,9 +8,9 @@ or that claims an impossible length; reading ends there and `notes` say where.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Generator, Iterator
+from collections.abc import Callable, Generator, Iterator, Mapping
 from dataclasses import dataclass, field
-from typing import Protocol
+from typing import Protocol, TypeAlias
 
 import numpy as np
 
@@ -20,10 +20,24 @@ from mlbatch.native.arena import PacketArena
 from mlbatch.native.capture import CaptureLoops
 from mlbatch.readers.byte_records import SLACK
 from mlbatch.readers.capture import link_types
-from mlbatch.readers.capture.fragments import MAX_DATAGRAM_BYTES, Reassembler
+from mlbatch.readers.capture.fragments import (
+    MAX_AGE_NS,
+    MAX_DATAGRAM_BYTES,
+    FragmentSet,
+    Key,
+    Reassembler,
+    SetTable,
+)
 from mlbatch.readers.capture.frames import Addresses, Frames, StreamNumbers, dissect, in_order
 from mlbatch.readers.source import BUFFER_BYTES, Source, Window
-from mlbatch.types import CaptureCounts, CutOff, PacketBatch, Recording, StreamTable
+from mlbatch.types import (
+    MAX_OVERLAP_NS,
+    CaptureCounts,
+    CutOff,
+    PacketBatch,
+    Recording,
+    StreamTable,
+)
 
 # Room for fragments of earlier buffers in addition to those of this one.
 _FRONT_EXTRA_BYTES = 1 << 20
@@ -59,6 +73,41 @@ class Walker(Protocol):
         ...
 
 
+# Addresses and identification of a set, as they are in every capture.
+PackedKey: TypeAlias = tuple[bytes, bytes, int]
+
+
+@dataclass(slots=True)
+class PassFragments:
+    """Open fragments of a pass over a capture; begin_ns, end_ns: receive times of its frames."""
+
+    sets: SetTable
+    addresses: Addresses
+    begin_ns: int | None = None
+    end_ns: int = 0
+
+    def span(self, host_ns: I64Array) -> None:
+        """Note the receive times (n,) of the next frames."""
+        if len(host_ns) and self.begin_ns is None:
+            self.begin_ns = int(host_ns[0])
+        self.end_ns = int(host_ns.max(initial=self.end_ns))
+
+    def packed(self, key: Key) -> PackedKey:
+        """Name of a set of this pass in any other one."""
+        source, destination, ident = key
+        return self.addresses.packed(source), self.addresses.packed(destination), ident
+
+    def take_over(self, sets: Mapping[PackedKey, FragmentSet], now_ns: int) -> None:
+        """Begin with sets of other captures."""
+        if not sets:
+            return
+        numbered = {
+            (self.addresses.number(source), self.addresses.number(destination), ident): held
+            for (source, destination, ident), held in sets.items()
+        }
+        self.sets.take_over(numbered, now_ns)
+
+
 @dataclass(slots=True)
 class CaptureRecording(Recording):
     """A capture file.
@@ -77,6 +126,40 @@ class CaptureRecording(Recording):
     # the file before records.
     first_record: Callable[[U8Array, bool], int | None] | None = None
     head_bytes: int = 0
+    # Of the newest pass, and sets of captures before this one for the next.
+    fragments: PassFragments | None = None
+    inherited: dict[PackedKey, FragmentSet] = field(default_factory=dict)
+    inherited_ns: int = 0
+
+    @property
+    def fragments_begin_ns(self) -> int | None:
+        """Receive time of the first frame of the newest pass, if it left datagrams open."""
+        fragments = self.fragments
+        return fragments.begin_ns if fragments is not None and fragments.sets.first_keys else None
+
+    def follow(self, earlier: Recording) -> None:
+        """Take over what `earlier` left open for the next pass, if this capture continues it.
+
+        It does where its first fragments belong to open sets of one that ended before it began.
+        """
+        begin_ns = self.fragments_begin_ns
+        if not isinstance(earlier, CaptureRecording) or begin_ns is None:
+            return
+        mine = self.fragments
+        theirs = earlier.fragments
+        if mine is None or theirs is None:
+            return
+        pause_ns = begin_ns - theirs.end_ns
+        if pause_ns > MAX_AGE_NS:
+            theirs.sets.forget()
+        if pause_ns < -MAX_OVERLAP_NS:
+            return
+        wanted = {mine.packed(key) for key in mine.sets.first_keys} - self.inherited.keys()
+        for key in theirs.sets.open_keys():
+            name = theirs.packed(key)
+            if name in wanted:
+                self.inherited[name] = theirs.sets.hand_over(key)
+                self.inherited_ns = max(self.inherited_ns, theirs.sets.now_ns)
 
     def last_packets(self, streams: StreamTable) -> PacketBatch | None:
         """Return packets in the last bytes; None for compressed files and unknown records."""
@@ -114,11 +197,15 @@ class CaptureRecording(Recording):
         self.position_bytes = 0
         current = _Pass(self)
         self.arena = None
+        self.fragments = current.fragments
+        self.fragments.take_over(self.inherited, self.inherited_ns)
+        self.inherited = {}
+        self.inherited_ns = 0
         try:
             with Source(self.path) as source:
                 yield from current.batches(source)
         finally:
-            current.reassembler.sets.finish()
+            self.fragments.sets.finish()
         current.check_links()
 
 
@@ -132,6 +219,7 @@ class _Pass:
         self.addresses = Addresses()
         self.numbers = StreamNumbers(self.addresses, recording.streams)
         self.reassembler = Reassembler(recording.counts, recording.together, self.loops)
+        self.fragments = PassFragments(self.reassembler.sets, self.addresses)
         self.arena = recording.arena
         read_bytes = 0 if self.arena is None else self.arena.read_bytes
         self.buffer_bytes = read_bytes or recording.buffer_bytes
@@ -189,6 +277,7 @@ class _Pass:
         data = window.data
         place = window.arena_place
         self._note_links(frames.link)
+        self.fragments.span(frames.host_ns)
         found = dissect(data, frames, self.addresses, self.loops)
         counts = self.recording.counts
         counts.frames += len(frames)
