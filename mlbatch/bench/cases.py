@@ -39,6 +39,8 @@ _CLOUD_POINTS: Final = CLOUD_RINGS * CLOUD_COLUMNS
 
 # Ethernet, IPv4 and UDP headers, and the header of a pcap record.
 _HEADERS_BYTES: Final = 14 + 20 + 8 + 16
+# A legacy IMU packet of Ouster.
+IMU_BYTES: Final = 48
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,11 +52,13 @@ class SensorKind:
     slots_per_s: int
     # Suffix of the metadata or calibration file it needs; empty: none.
     suffix: str
+    # Packets of its IMU, of IMU_BYTES.
+    imu_per_s: int = 0
 
 
 KINDS: Final[Mapping[str, SensorKind]] = {
-    LOW: SensorKind(640, 8448, 10_240 * 128, ".json"),
-    FULL: SensorKind(640, 24832, 10_240 * 128, ".json"),
+    LOW: SensorKind(640, 8448, 10_240 * 128, ".json", imu_per_s=100),
+    FULL: SensorKind(640, 24832, 10_240 * 128, ".json", imu_per_s=100),
     VLP16: SensorKind(754, 1206, 18_084 * 16, ""),
     VLS128: SensorKind(6030, 1206, 18_090 * 128, ""),
     PANDAR64: SensorKind(3000, 1198, 18_000 * 64, ".csv"),
@@ -89,11 +93,15 @@ class BenchSensor:
 
 @dataclass(frozen=True, slots=True)
 class BenchRecording:
-    """A standard recording; fragments: packets are sent in IPv4 fragments of 1500 bytes."""
+    """A standard recording; fragments: packets are sent in IPv4 fragments of 1500 bytes.
+
+    imu: lidars with an IMU send its packets, too.
+    """
 
     name: str
     sensors: tuple[BenchSensor, ...]
     fragments: bool = False
+    imu: bool = True
 
     @property
     def is_bag(self) -> bool:
@@ -109,7 +117,9 @@ class BenchRecording:
     def bytes_per_s(self) -> int:
         """Approximate size of the recording per second."""
         kinds = [KINDS[sensor.kind] for sensor in self.sensors]
-        return sum(kind.packets_per_s * (kind.packet_bytes + _HEADERS_BYTES) for kind in kinds)
+        lidars = sum(kind.packets_per_s * (kind.packet_bytes + _HEADERS_BYTES) for kind in kinds)
+        imus = sum(kind.imu_per_s for kind in kinds) if self.imu else 0
+        return lidars + imus * (IMU_BYTES + _HEADERS_BYTES)
 
     @property
     def slots_per_s(self) -> int:
@@ -189,6 +199,7 @@ RECORDINGS: Final[Mapping[str, BenchRecording]] = {
     for recording in (
         BenchRecording("dual-4", _dual(LOW)),
         BenchRecording("dual-4-fragments", _dual(LOW), fragments=True),
+        BenchRecording("dual-4-no-imu", _dual(LOW), imu=False),
         BenchRecording("dual-12", _dual(FULL)),
         BenchRecording("dual-12-fragments", _dual(FULL), fragments=True),
         BenchRecording("eight-4", _eight(LOW)),
@@ -294,9 +305,22 @@ def _by_windows() -> tuple[Conversion, ...]:
     )
 
 
+def _by_imu() -> tuple[Conversion, ...]:
+    """Dry runs without and with packets of IMUs."""
+    plain = Conversion("no IMU", "dual-4-no-imu")
+    often = replace(plain, name="no IMU, 100 Hz", options=("--rate", "100"))
+    return (
+        plain,
+        replace(plain, name="IMU", recording="dual-4", base=plain.name),
+        often,
+        replace(often, name="IMU, 100 Hz", recording="dual-4", base=often.name),
+    )
+
+
 CASES: Final = (
     Case("dual-4", ("dual-4", "dual-4-fragments")),
     Case("dual-4-windows", ("dual-4",), variants=_by_windows()),
+    Case("dual-4-imu", ("dual-4-no-imu", "dual-4"), variants=_by_imu()),
     Case("dual-12", ("dual-12", "dual-12-fragments")),
     Case("eight-4", ("eight-4",)),
     Case("three-vlp16", ("three-vlp16",)),

@@ -9,8 +9,8 @@ of one revolution are encoded once; later packets repeat its pixels with their o
 angles and counters. Ranges are waves with noise and no-return regions: about a fifth of the shots,
 as outdoors.
 
-Source of packets: docs/sources/ouster.md sections 1 to 3, docs/sources/velodyne.md sections 1 and
-2, docs/sources/hesai.md sections 2, 3 and 6. Source of frames: RFC 791 (IPv4), RFC 768 (UDP; no
+Source of packets: docs/sources/ouster.md sections 1 to 3 and 8, docs/sources/velodyne.md sections 1
+and 2, docs/sources/hesai.md sections 2, 3 and 6. Source of frames: RFC 791 (IPv4), RFC 768 (UDP; no
 checksum: 0), draft-ietf-opsawg-pcap.
 """
 
@@ -157,6 +157,31 @@ def ouster(profile: str, serial: int) -> PacketEncoder:
 
     packet_ns = REVOLUTION_NS * _OUSTER_COLUMNS_PER_PACKET // _OUSTER_COLUMNS
     return PacketEncoder.from_packets(packets, packet_ns, update)
+
+
+_IMU_NS: Final = 10 * NS_PER_MS
+_IMU: Final = np.dtype(
+    [
+        ("system_ns", "<u8"),
+        ("acceleration_ns", "<u8"),
+        ("gyroscope_ns", "<u8"),
+        ("acceleration_g", "<f4", 3),
+        ("angular_velocity_deg", "<f4", 3),
+    ]
+)
+
+
+def ouster_imu() -> PacketEncoder:
+    """The IMU of an Ouster at rest."""
+    packets = np.zeros(1, _IMU)
+    packets["acceleration_g"] = [0, 0, 1]
+
+    def update(payloads: U8Array, numbers: I64Array, begin_ns: I64Array) -> None:
+        sent = payloads.view(_IMU)[:, 0]
+        for name in ("system_ns", "acceleration_ns", "gyroscope_ns"):
+            sent[name] = begin_ns + _IMU_NS
+
+    return PacketEncoder.from_packets(packets, _IMU_NS, update)
 
 
 # A reading of Velodyne and of HESAI; the range is in steps of the vendor.
@@ -338,6 +363,7 @@ _RECEIVER: Final = ipaddress.IPv4Address("192.168.7.2").packed
 _MORE_FRAGMENTS: Final = 0x2000
 # Time of a full frame on 1 Gbit/s Ethernet, between fragments of a packet.
 _FRAGMENT_STEP_NS: Final = 12 * NS_PER_US
+_IMU_FIRST_IDENT: Final = 1 << 15
 # Packets are made for this much time at once, which bounds memory.
 CHUNK_NS: Final = 500 * NS_PER_MS
 
@@ -347,11 +373,15 @@ CaptureRecord: TypeAlias = tuple[int, U8Array]
 
 @dataclass(frozen=True, slots=True)
 class Source:
-    """A lidar on the network; phase_ns: delay of its rotor."""
+    """A lidar, or its IMU, on the network; phase_ns: delay of its rotor.
+
+    first_ident: IP identification of its first packet.
+    """
 
     encoder: PacketEncoder
     stream: Stream
     phase_ns: int
+    first_ident: int = 0
 
 
 def write_capture(path: Path, sources: Sequence[Source], seconds: float, mtu: int) -> None:
@@ -386,10 +416,11 @@ def capture_records(source: Source, numbers: I64Array, mtu: int) -> Iterator[Cap
     udp = np.frombuffer(_UDP.pack(port, port, size, 0), np.uint8)
     datagrams = np.concatenate([np.broadcast_to(udp, (len(numbers), _UDP.size)), payloads], 1)
     step = (mtu - _IP.size) // 8 * 8
+    idents = (source.first_ident + numbers) & 0xFFFF
     for fragment, offset in enumerate(range(0, size, step)):
         part = datagrams[:, offset : offset + step]
         flags = offset // 8 | (_MORE_FRAGMENTS if offset + step < size else 0)
-        ip = _ip_headers(source.stream.source_ip, numbers & 0xFFFF, flags, part.shape[1])
+        ip = _ip_headers(source.stream.source_ip, idents, flags, part.shape[1])
         at_ns = receive_ns + fragment * _FRAGMENT_STEP_NS
         yield from zip(at_ns.tolist(), _pcap_records(at_ns, ip, part), strict=True)
 
@@ -437,7 +468,10 @@ def make(recording: BenchRecording, seconds: float, folder: Path) -> None:
         write_clouds(partial_path, recording.sensors, seconds)
     else:
         mtu = ETHERNET_MTU if recording.fragments else JUMBO_MTU
-        write_capture(partial_path, [_source(one) for one in recording.sensors], seconds, mtu)
+        sources = [_source(one) for one in recording.sensors]
+        if recording.imu:
+            sources += [_imu(one) for one in recording.sensors if KINDS[one.kind].imu_per_s]
+        write_capture(partial_path, sources, seconds, mtu)
     partial_path.replace(folder / recording.file)
     (folder / DIGEST).write_text(digest(), encoding="utf-8")
 
@@ -445,6 +479,12 @@ def make(recording: BenchRecording, seconds: float, folder: Path) -> None:
 def _source(sensor: BenchSensor) -> Source:
     encoder = ENCODERS[sensor.kind](sensor.serial)
     return Source(encoder, Stream(sensor.source_ip, sensor.port), sensor.phase_ns)
+
+
+def _imu(sensor: BenchSensor) -> Source:
+    """The IMU of an Ouster, which sends to the next port."""
+    stream = Stream(sensor.source_ip, sensor.port + 1)
+    return Source(ouster_imu(), stream, sensor.phase_ns, _IMU_FIRST_IDENT)
 
 
 def _rig(sensors: Sequence[BenchSensor]) -> str:

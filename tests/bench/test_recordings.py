@@ -28,6 +28,9 @@ EPOCH_S = 1_700_000_000
 # 640 packets per second, 64 per revolution; the second sensor's rotor is 37.1 ms late: 23.7 packets
 # less.
 OUSTER_PACKETS = {"192.168.7.11": 640, "192.168.7.12": 616}
+# 100 per second, the second sensor's 37.1 ms late.
+IMU_PACKETS = {"192.168.7.11": 100, "192.168.7.12": 96}
+IMU_BYTES = 48
 A_IP, B_IP = OUSTER_PACKETS
 
 
@@ -58,13 +61,33 @@ def datagrams(path: Path) -> Iterator[tuple[float, str, bytes]]:
 def test_two_ousters(folder: Path, name: str, size: int) -> None:
     """docs/sources/ouster.md: header 32, 16 columns of 12 bytes and 128 pixels, footer 32."""
     sent = Counter((source, len(data)) for _, source, data in datagrams(folder / name))
-    assert sent == Counter({(source, size): count for source, count in OUSTER_PACKETS.items()})
+    lidars = {(source, size): count for source, count in OUSTER_PACKETS.items()}
+    imus = {(source, IMU_BYTES): count for source, count in IMU_PACKETS.items()}
+    assert sent == lidars | imus
+
+
+def test_ouster_imu_samples_are_10_ms_apart(folder: Path) -> None:
+    """docs/sources/ouster.md section 8: three times in ns, m/s2 / 9.80665, deg/s."""
+    sent = [one for one in datagrams(folder / "dual-4") if len(one[2]) == IMU_BYTES]
+    of_b = [
+        (host_s, struct.unpack("<3q6f", data)) for host_s, source, data in sent if source == B_IP
+    ]
+    for number, (host_s, (*stamps_ns, x, y, z, _, _, _)) in enumerate(of_b, 1):
+        stamp_ns = EPOCH_S * 10**9 + 37_100_000 + number * 10_000_000
+        assert stamps_ns == [stamp_ns] * 3
+        assert (x, y, z) == (0, 0, 1)
+        assert 0 < host_s - stamp_ns / 1e9 < 0.001
+
+
+def test_a_recording_without_imu_has_the_same_lidar_packets(folder: Path) -> None:
+    plain, both = (datagrams(folder / name) for name in ("dual-4-no-imu", "dual-4"))
+    assert list(plain) == [one for one in both if len(one[2]) != IMU_BYTES]
 
 
 def test_ouster_columns_are_consecutive(folder: Path) -> None:
     stamps_ns: list[int] = []
     for number, (host_s, _, data) in enumerate(
-        one for one in datagrams(folder / "dual-4") if one[1] == B_IP
+        one for one in datagrams(folder / "dual-4") if one[1] == B_IP and len(one[2]) != IMU_BYTES
     ):
         kind, frame_id = struct.unpack_from("<HH", data)
         assert (kind, frame_id) == (1, number // 64)
@@ -106,12 +129,15 @@ def test_fragments_join_to_the_plain_packets(folder: Path) -> None:
         data = joined.setdefault((source, ip_id), bytearray(8456))
         data[offset : offset + len(frame) - 34] = frame[34:]
         counts[source, ip_id] += 1
+    # One frame for each packet of an IMU.
+    assert Counter(counts.values())[1] == sum(IMU_PACKETS.values())
+    counts = Counter({key: count for key, count in counts.items() if count > 1})
     # 8456 bytes in fragments of 1480.
     assert set(counts.values()) == {6}
     for _, frame in records(folder / "dual-4"):
         source = frame[26:30]
         ip_id = int.from_bytes(frame[18:20], "big")
-        assert joined.pop((source, ip_id)) == frame[34:]
+        assert joined.pop((source, ip_id))[: len(frame) - 34] == frame[34:]
     assert not joined
 
 
