@@ -20,7 +20,7 @@ from fnmatch import fnmatchcase
 
 import numpy as np
 
-from mlbatch.arrays import BoolArray
+from mlbatch.arrays import BoolArray, I64Array
 from mlbatch.batching.intake import STAMP_LIMIT_NS
 from mlbatch.clocks.timescale import format_difference
 from mlbatch.errors import ClockError, UsageError
@@ -122,12 +122,12 @@ class ImuQueue:
         self._counts = list(counts)
         self._offsets_ns = list(offsets_ns)
         self._has_place = has_place
-        self._waiting: list[ImuSamples] = []
+        self._buffers = [_ImuBuffer(number) for number in range(len(self._counts))]
 
     @property
     def is_waiting(self) -> bool:
         """True if there are samples in the queue."""
-        return bool(self._waiting)
+        return any(map(len, self._buffers))
 
     def add(self, samples: ImuSamples) -> None:
         """Add samples of one sensor."""
@@ -136,56 +136,82 @@ class ImuQueue:
         if not self._has_place:
             counts.drop("no_place", len(samples.stamp_ns))
             return
-        samples.stamp_ns = samples.stamp_ns + self._offsets_ns[samples.sensor]
-        sane = (samples.stamp_ns >= 0) & (samples.stamp_ns < STAMP_LIMIT_NS)
-        samples = self._kept(samples, sane, "bad_stamp")
-        if len(samples.stamp_ns):
-            self._waiting.append(samples)
-        if len(self._waiting) > _MOST_PARTS:
-            self._join()
-
-    def _join(self) -> None:
-        """Join the samples of each sensor, in the order in which they came."""
-        parts = self._waiting
-        numbers = sorted({part.sensor for part in parts})
-        self._waiting = [_joined([p for p in parts if p.sensor == number]) for number in numbers]
+        stamp_ns = samples.stamp_ns + self._offsets_ns[samples.sensor]
+        samples.stamp_ns = stamp_ns
+        sane = (stamp_ns >= 0) & (stamp_ns < STAMP_LIMIT_NS)
+        if not sane.all():
+            counts.drop("bad_stamp", int(np.count_nonzero(~sane)))
+            samples = _part(samples, sane)
+        self._buffers[samples.sensor].add(samples)
 
     def drop_before(self, low_ns: int) -> None:
         """Drop samples before the first limit."""
-        kept = [self._kept(one, one.stamp_ns >= low_ns, "outside_time") for one in self._waiting]
-        self._waiting = [samples for samples in kept if len(samples.stamp_ns)]
+        for counts, buffer in zip(self._counts, self._buffers, strict=True):
+            dropped = buffer.take_before(low_ns)
+            if dropped is not None:
+                counts.drop("outside_time", len(dropped.stamp_ns))
 
     def drain_until(self, end_ns: int | None, limits_ns: TimeLimits) -> list[ImuSamples]:
         """Samples before `end_ns` (None: all) and inside the limits, by timestamp."""
-        if not self._waiting:
-            return []
         low_ns, high_ns = limits_ns
+        if low_ns is not None:
+            self.drop_before(low_ns if end_ns is None else min(low_ns, end_ns))
         taken = []
-        later = []
-        for number in sorted({samples.sensor for samples in self._waiting}):
-            samples = _in_order([one for one in self._waiting if one.sensor == number])
-            count = len(samples.stamp_ns)
-            if end_ns is not None:
-                count = int(np.searchsorted(samples.stamp_ns, end_ns))
-                later.append(_part(samples, slice(count, None)))
-            samples = _part(samples, slice(0, count))
-            inside = np.ones(count, bool)
-            if low_ns is not None:
-                inside &= samples.stamp_ns >= low_ns
-            if high_ns is not None:
-                inside &= samples.stamp_ns < high_ns
-            samples = self._kept(samples, inside, "outside_time")
-            if len(samples.stamp_ns):
-                self._counts[number].written += len(samples.stamp_ns)
+        for counts, buffer in zip(self._counts, self._buffers, strict=True):
+            samples = buffer.take_before(end_ns)
+            if samples is not None and high_ns is not None:
+                count = int(np.searchsorted(samples.stamp_ns, high_ns))
+                counts.drop("outside_time", len(samples.stamp_ns) - count)
+                samples = _part(samples, slice(0, count))
+            if samples is not None and len(samples.stamp_ns):
+                counts.written += len(samples.stamp_ns)
                 taken.append(samples)
-        self._waiting = [samples for samples in later if len(samples.stamp_ns)]
         return sorted(taken, key=lambda samples: (int(samples.stamp_ns[0]), samples.sensor))
 
-    def _kept(self, samples: ImuSamples, keep: BoolArray, reason: str) -> ImuSamples:
-        if keep.all():
-            return samples
-        self._counts[samples.sensor].drop(reason, int(np.count_nonzero(~keep)))
-        return _part(samples, keep)
+
+class _ImuBuffer:
+    """IMU samples of one sensor that wait, sorted by timestamp when they are asked for."""
+
+    def __init__(self, sensor: int) -> None:
+        none = np.zeros((0, 3))
+        self._sorted = ImuSamples(sensor, np.zeros(0, np.int64), none, none)
+        # Index of the first sample that was not taken.
+        self._at = 0
+        self._new: list[ImuSamples] = []
+
+    def __len__(self) -> int:
+        new = sum(len(samples.stamp_ns) for samples in self._new)
+        return len(self._sorted.stamp_ns) - self._at + new
+
+    def add(self, samples: ImuSamples) -> None:
+        """Add samples, in the order in which they came."""
+        if len(samples.stamp_ns):
+            self._new.append(samples)
+        if len(self._new) > _MOST_PARTS:
+            self._sort()
+
+    def take_before(self, end_ns: int | None) -> ImuSamples | None:
+        """Take the samples before a time (None: all); None without any."""
+        if self._new:
+            self._sort()
+        stamp_ns = self._sorted.stamp_ns
+        begin = self._at
+        if begin == len(stamp_ns):
+            return None
+        end = len(stamp_ns) if end_ns is None else int(stamp_ns.searchsorted(end_ns))
+        if end <= begin:
+            return None
+        self._at = end
+        return _part(self._sorted, slice(begin, end))
+
+    def _sort(self) -> None:
+        """Sort what waits by timestamp: packets may be reordered."""
+        samples = _joined([_part(self._sorted, slice(self._at, None)), *self._new])
+        if not bool((np.diff(samples.stamp_ns) >= 0).all()):
+            samples = _part(samples, np.argsort(samples.stamp_ns, kind="stable"))
+        self._sorted = samples
+        self._at = 0
+        self._new = []
 
 
 def _joined(parts: Sequence[ImuSamples]) -> ImuSamples:
@@ -198,19 +224,7 @@ def _joined(parts: Sequence[ImuSamples]) -> ImuSamples:
     )
 
 
-def _in_order(parts: Sequence[ImuSamples]) -> ImuSamples:
-    """Samples of one sensor as one, by timestamp: packets may be reordered."""
-    samples = _joined(parts)
-    order = np.argsort(samples.stamp_ns, kind="stable")
-    return ImuSamples(
-        samples.sensor,
-        samples.stamp_ns[order],
-        samples.acceleration[order],
-        samples.angular_velocity[order],
-    )
-
-
-def _part(samples: ImuSamples, which: BoolArray | slice) -> ImuSamples:
+def _part(samples: ImuSamples, which: BoolArray | I64Array | slice) -> ImuSamples:
     return ImuSamples(
         samples.sensor,
         samples.stamp_ns[which],

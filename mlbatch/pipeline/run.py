@@ -23,6 +23,7 @@ from mlbatch.pipeline.scan_task import ScanTask, forward
 from mlbatch.pipeline.workers import OrderedWorkers, run_inline
 from mlbatch.report.report import RunReport, fill_totals, imbalances, report_text
 from mlbatch.types import ImuSamples, Message, RunInfo, Summary
+from mlbatch.units import NS_PER_S
 from mlbatch.writers import ScanJob, ScanWriter
 
 if TYPE_CHECKING:
@@ -37,6 +38,8 @@ _AHEAD = 2
 _WAITING = 2
 # Messages that are taken from their queue and written at a time.
 _PORTION_BYTES = 1 << 18
+# How often a dry run counts what it would pass through, in time of scans.
+_DRY_NS = NS_PER_S
 
 
 def convert(
@@ -89,6 +92,8 @@ class _Output:
         self._resume_log = resume_log
         self._idle: list[DecodeWorker] = []
         self._is_begun = False
+        # Up to where IMU samples and messages were passed through.
+        self._passed_ns = 0
 
     def make(self, progress: Progress | None) -> None:
         """Decode and write all scans."""
@@ -112,7 +117,11 @@ class _Output:
     def _scan_tasks(self, item: DecodeTask | SkippedWindow) -> Iterator[ScanTask]:
         """The task of a scan with the messages before it; many messages are tasks of their own."""
         task = None if isinstance(item, SkippedWindow) else item
-        before = self._run.passed_through(item.end_ns, _PORTION_BYTES)
+        before: Sequence[ImuSamples | Message] = ()
+        # What is only counted need not be cut at every window.
+        if self._open_writer is not None or item.end_ns >= self._passed_ns + _DRY_NS:
+            self._passed_ns = item.end_ns
+            before = self._run.passed_through(item.end_ns, _PORTION_BYTES)
         # After nothing there is no more.
         while before and (rest := self._run.passed_through(item.end_ns, _PORTION_BYTES)):
             yield self._scan_task(None, before, task)

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from fractions import Fraction
 from pathlib import Path
 from typing import cast
+from unittest.mock import patch
 
 import numpy as np
 import pytest
@@ -15,9 +17,10 @@ from mlbatch.discovery.discover import SensorSelection
 from mlbatch.errors import ClockError, ExportError, RecordingError, UsageError
 from mlbatch.pipeline.conversion import Conversion
 from mlbatch.pipeline.job import Job, wait_ns
+from mlbatch.pipeline.passthrough import ImuQueue
 from mlbatch.pipeline.run import convert
 from mlbatch.report.report import RunReport
-from mlbatch.types import RunInfo, Scan
+from mlbatch.types import EXTRAS, IMU, RunInfo, Scan
 from tests.builders.run import FIXTURE, TWO_LIDARS, Memory, in_memory
 from tests.builders.sessions import EPOCH_NS, NS_PER_MS, NS_PER_S, Unit, twin, write_session
 
@@ -136,6 +139,20 @@ def test_the_stages_take_no_longer_than_the_run() -> None:
     assert 0 < parts <= timing.wall_s
     # From the first receive time to the last (SOURCE.md: 20 to 870 ms).
     assert timing.recorded_s == pytest.approx(0.85, abs=0.01)
+
+
+def test_a_dry_run_cuts_no_imu_samples_at_windows() -> None:
+    """At 100 Hz the 0.85 s of the fixture are tens of windows; its lidars send IMU packets."""
+    job = replace(FIXTURE, rate=Fraction(100), extras=EXTRAS | {IMU})
+    cut = ImuQueue.drain_until
+    with patch.object(ImuQueue, "drain_until", autospec=True, side_effect=cut) as called:
+        _, dry = convert(job, None)
+    assert dry.scans.written > 20
+    # Twice per second of scans, until nothing is left, and at the end.
+    assert called.call_count <= 4
+    ledgers = [sensor.ledger for sensor in in_memory(job).report.sensors]
+    assert [sensor.ledger for sensor in dry.sensors] == ledgers
+    assert all(ledger.imu_samples.written for ledger in ledgers)
 
 
 def test_a_dry_run_reports_the_same() -> None:
