@@ -18,7 +18,8 @@ def test_names_are_unique() -> None:
 
 def test_disk_bytes() -> None:
     by_name = {case.name: case for case in CASES}
-    low = 2 * 640 * (8448 + 58)
+    # Two lidars, and their IMUs.
+    low = 2 * 640 * (8448 + 58) + 2 * 100 * (48 + 58)
     assert RECORDINGS["dual-4"].bytes_per_s == low
     # The recording, plain and in fragments, but no output.
     assert disk_bytes([by_name["dual-4"]], 2.0) == 4 * low

@@ -154,10 +154,10 @@ class CaptureRecording(Recording):
             theirs.sets.forget()
         if pause_ns < -MAX_OVERLAP_NS:
             return
-        wanted = {mine.packed(key) for key in mine.sets.first_keys} - self.inherited.keys()
+        first = {mine.packed(key) for key in mine.sets.first_keys} - self.inherited.keys()
         for key in theirs.sets.open_keys():
             name = theirs.packed(key)
-            if name in wanted:
+            if name in first:
                 self.inherited[name] = theirs.sets.hand_over(key)
                 self.inherited_ns = max(self.inherited_ns, theirs.sets.now_ns)
 
