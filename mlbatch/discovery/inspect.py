@@ -76,9 +76,7 @@ _MEASURE = (
     "{translation_m: [x, y, z], rotation_rpy_deg: [r, p, y]}"
 )
 # Warnings that concern a conversion; the table shows missing metadata and decoders.
-_CONVERSION_ONLY = frozenset(
-    {"no_decoder", "no_metadata", "not_seen_yet", "identity_extrinsics"}
-)
+_CONVERSION_ONLY = frozenset({"no_decoder", "no_metadata", "not_seen_yet", "identity_extrinsics"})
 
 
 @dataclass(frozen=True, slots=True)
