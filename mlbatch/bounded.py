@@ -55,10 +55,13 @@ def read_text(path: Path, most: int = MOST_BYTES, encoding: str = "utf-8") -> st
     return read_bytes(path, most).decode(encoding)
 
 
-def parse_json(text: str | bytes) -> Any:
-    """The value of a JSON text; ValueError also for NaN, infinity and text nested too deeply."""
+def parse_json(text: str | bytes, *, has_nan: bool = False) -> Any:
+    """The value of a JSON text; ValueError also for NaN, infinity and text nested too deeply.
+
+    has_nan: of a file of mlbatch itself that has NaN where a number is unknown.
+    """
     try:
-        return json.loads(text, parse_constant=_refuse, parse_float=_finite)
+        return json.loads(text, parse_constant=float if has_nan else _refuse, parse_float=_finite)
     except RecursionError as err:
         raise ValueError("brackets nested too deeply") from err
 

@@ -359,7 +359,7 @@ def read_account(part: Path) -> Account:
     """The account of a shard; UsageError if there is none, RecordingError if it is damaged."""
     path = part / SHARD_JSON
     try:
-        content = _fields(parse_json(read_text(path)))
+        content = _fields(parse_json(read_text(path), has_nan=True))
     except FileNotFoundError:
         raise UsageError(f"{part}: expected the folder of a shard, found {_found(part)}") from None
     except NotADirectoryError:

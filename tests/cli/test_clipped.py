@@ -157,7 +157,8 @@ def test_a_resumed_run_counts_those_of_the_scans_before(
 
 
 def test_with_strict_clipping_is_an_error(shell: Shell, tmp_path: Path) -> None:
-    _clouds(tmp_path, [0, 256])
+    # Points to the end of a sweep, as of a driver that publishes it then.
+    _clouds(tmp_path, [0.0] * 9 + [256.0])
     outcome = shell(
         "convert drive.mcap -o out.mcap --keep-partial --point-layout autoware --strict"
     )

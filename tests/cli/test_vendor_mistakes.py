@@ -154,7 +154,7 @@ def _write_others(folder: Path) -> None:
     livox = [(host_ns + since_ns, payload) for host_ns, payload in livox_payloads(uptime, MANY)]
     write_capture(folder / "livox", framed(livox, IP, 56301), ouster().records)
     write_metadata(folder / "livox" / "111.json", ouster().spec)
-    points = [(1.0, 2.0, 3.0, 9.0, n * 25_000_000, 1) for n in range(4)]
+    points = [(1.0, 2.0, 3.0, 9.0, n * 32_000_000, 1) for n in range(4)]
     clouds = [
         Recorded(
             "/points",

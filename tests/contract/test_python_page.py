@@ -90,7 +90,7 @@ OUTPUT = {
     "jobs": 2,
 }
 # What an option needs beside it.
-WITH = {
+WITH: dict[str, dict[str, Any]] = {
     "align_to": {"align_clocks": True},
     "batching_times": {"batching": "latest"},
     "deskew_to": {"deskew": "constant-velocity"},
@@ -121,7 +121,7 @@ def test_the_page_has_every_option_of_the_command() -> None:
 def test_every_option_of_the_page_works(name: str, tmp_path: Path) -> None:
     capture = FIXTURE / "two_lidars.pcap"
     value = {**SESSION, **WINDOWS, **OUTPUT}[name]
-    options: Any = {"rig": FIXTURE / "rig.yaml", name: value} | WITH.get(name, {})
+    options: dict[str, Any] = {"rig": FIXTURE / "rig.yaml", name: value, **WITH.get(name, {})}
     if name in ("only", "ignore"):
         # Its rig names both.
         options = {name: "ouster_122647000123", "identity_extrinsics": True}

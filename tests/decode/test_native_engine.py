@@ -71,8 +71,12 @@ OTHERS = (
 
 def ouster(profile: str, beams: int, seed: int = 0) -> Lidar:
     """A sensor with beams of its own."""
-    angles = np.random.default_rng(seed).uniform(-22, 22, (2, beams)).round(2).tolist()
-    spec = OusterSpec(profile, beams, 512, altitude_deg=angles[0], azimuth_deg=angles[1])
+    angles = np.random.default_rng(seed).uniform(-22, 22, (2, beams)).round(2)
+    # From the top beam to the lowest.
+    angles[0][::-1].sort()
+    spec = OusterSpec(
+        profile, beams, 512, altitude_deg=angles[0].tolist(), azimuth_deg=angles[1].tolist()
+    )
     found = read_calibration(Path("sensor.json"), json.dumps(metadata_json(spec)).encode())
     assert found is not None
     return cast(Lidar, found.lidar({}, None))

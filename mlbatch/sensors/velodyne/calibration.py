@@ -187,9 +187,13 @@ def _yaml_root(path: Path, text: str) -> Mapping[str, object]:
                 raise _error(path, "", "values written out", f"the alias *{event.anchor}")
         root: object = yaml.load(text, Loader=loader)
     except yaml.YAMLError as err:
+        problem = getattr(err, "problem", "") or str(err)
+        if "nesting" in problem:
+            # From PyYAML 6.0.3 on its scanner counts the brackets ahead of these events.
+            raise _error(path, "", f"at most {_YAML_LEVELS} levels", "more") from err
         mark = getattr(err, "problem_mark", None)
         place = f"line {mark.line + 1}" if mark else ""
-        raise _error(path, place, "YAML", getattr(err, "problem", "") or str(err)) from err
+        raise _error(path, place, "YAML", problem) from err
     return root if isinstance(root, dict) else {}
 
 
