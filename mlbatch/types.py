@@ -83,6 +83,9 @@ class StreamTable:
     # Streams whose packets have no receive time of their own: `host_ns` is the log time of a
     # message with many packets, so that `--clock host` cannot be used.
     untimed: set[int] = field(default_factory=set)
+    # By stream: most packets in a message, and longest time of a message of decoded points, ns.
+    most_packets: dict[int, int] = field(default_factory=dict)
+    message_ns: dict[int, int] = field(default_factory=dict)
     _numbers: dict[Stream, int] = field(default_factory=dict)
 
     def number(self, stream: Stream) -> int:

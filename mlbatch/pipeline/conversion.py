@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple, TypeVar
 
-from mlbatch.batching.batcher import Batcher
+from mlbatch.batching.batcher import SLACK_NS, Batcher
 from mlbatch.batching.grid import Grid
 from mlbatch.batching.merge import column_merge
 from mlbatch.batching.windows import OWN, Policy, Window
@@ -30,7 +30,7 @@ from mlbatch.pipeline.time_limits import refuse_outside
 from mlbatch.report.ledger import PointCounts
 from mlbatch.report.scan_table import ScanTable
 from mlbatch.types import BYTE_INTENSITY, ImuSamples, Message, RunInfo, Scan
-from mlbatch.units import NS_PER_S, rate_text
+from mlbatch.units import NS_PER_MS, NS_PER_S, rate_text
 
 if TYPE_CHECKING:
     from mlbatch.batching.fusion import SweepFusion
@@ -140,8 +140,24 @@ class Conversion:
         self._pool: DecodePool | None = None
         if job.max_wait_ns is None:
             self.warn(Note("max_wait", "", "--max-wait inf: memory grows while a sensor is silent"))
+        elif len(self.sensors) > 1:
+            self._warn_of_long_messages(job.max_wait_ns)
         for note in self.session.setup.notes:
             self.warn(note)
+
+    def _warn_of_long_messages(self, max_wait_ns: int) -> None:
+        """Warn where a sensor counts as silent between two of its messages."""
+        for sensor in self.sensors:
+            message_ns = sensor.message_ns(self.session.setup.sampler.table)
+            if message_ns + SLACK_NS > max_wait_ns:
+                length_s = message_ns / NS_PER_S
+                text = (
+                    f"--max-wait {max_wait_ns / NS_PER_S:g}: expected more than a message of "
+                    f"{sensor.name}, which holds {length_s:.3g} s of its packets; it counts as "
+                    f"silent until the next one, and other containers give other scans; "
+                    f"give at least {math.ceil((message_ns + 2 * SLACK_NS) / NS_PER_MS) / 1e3:g}"
+                )
+                self.warn(Note("max_wait", sensor.name, text))
 
     def _deskew(self) -> Deskew | ConstantVelocity | None:
         """What moves columns, by `--deskew`; None without."""

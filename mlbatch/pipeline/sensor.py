@@ -18,6 +18,8 @@ from mlbatch.lidar.interface import Lidar
 from mlbatch.native.arena import PacketArena
 from mlbatch.report.ledger import SensorLedger
 from mlbatch.rig.rig import RigSensor
+from mlbatch.types import StreamTable
+from mlbatch.units import NS_PER_S
 
 if TYPE_CHECKING:
     from mlbatch.clocks.align import ClockMap
@@ -95,6 +97,16 @@ class Sensor:
     def is_required(self) -> bool:
         """True if the rig requires at least one packet of it."""
         return self.rig is not None and not self.rig.optional
+
+    def message_ns(self, table: StreamTable) -> float:
+        """Longest time of a message of several packets of this sensor, ns; 0: single ones."""
+        lidar = self.lidar
+        per_s = lidar.columns_per_s
+        packet_ns = NS_PER_S * lidar.columns_per_packet / per_s if per_s else 0.0
+        streams = self.detected.streams
+        spans = [table.message_ns.get(stream, 0) for stream in streams]
+        most = max((table.most_packets.get(stream, 0) for stream in streams), default=0)
+        return max(*spans, 0, most * packet_ns if most > 1 else 0)
 
     def intake(self) -> Intake:
         """A new intake of the batcher for this sensor."""

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import functools
+import re
+from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
 
@@ -104,3 +106,25 @@ def test_scans_do_not_depend_on_the_files_of_a_session(
     paths.append(CONTAINERS["pcapng"](tmp_path, (velodyne_unit,)))
     found = in_memory(job(angles(tmp_path), paths[first], paths[1 - first]))
     assert prints(found) == plain
+
+
+@pytest.mark.parametrize(("name", "codes"), [("pcap", []), ("db3", ["max_wait", "max_wait"])])
+def test_a_message_that_is_longer_than_the_wait_is_warned_of(
+    name: str, codes: list[str], tmp_path: Path
+) -> None:
+    """A message is a sweep of 100 ms, after which 50 ms are over."""
+    short = replace(
+        job(angles(tmp_path), CONTAINERS[name](tmp_path, pair())), max_wait_ns=50 * NS_PER_MS
+    )
+    warned = [one for one in in_memory(short).report.warnings if one.code == "max_wait"]
+    assert [one.code for one in warned] == codes
+    for one in warned:
+        found = re.fullmatch(
+            r"--max-wait 0\.05: expected more than a message of \S+, which holds (0\.\d+) s .*"
+            r"; give at least (0\.\d+)",
+            one.message,
+        )
+        assert found is not None, one.message
+        # The sweeps of the builder are cut by receive time: 100 ms, and a packet.
+        assert 0.09 < float(found[1]) <= 0.102
+        assert float(found[2]) >= float(found[1]) + 0.01

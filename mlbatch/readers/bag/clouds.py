@@ -19,7 +19,7 @@ from mlbatch.arrays import I64Array, U8Array
 from mlbatch.lidar.content_keys import hash_factors
 from mlbatch.native.arena import PacketArena
 from mlbatch.readers.bag.cloud_topics import CloudTopics, take_of
-from mlbatch.ros.point_packets import CloudError, Pack, Points, layout_of, pack
+from mlbatch.ros.point_packets import HEAD, CloudError, Pack, Points, layout_of, pack
 from mlbatch.ros.point_rows import Take, take_rows
 from mlbatch.ros.point_times import stamps
 from mlbatch.ros.pointcloud2 import CLOUD_TYPES, Cloud, raw_cloud, read_cloud
@@ -334,7 +334,7 @@ class CloudRecording(WrappedRecording):
             part = np.empty((5, count), np.int64)
             part[0] = end + np.arange(count) * size
             part[1] = size
-            part[2] = self._number(one.stream)
+            part[2] = self._number(one)
             part[3:] = one.message.host_ns
             parts.append(part)
             data.append(one.packets.reshape(-1))
@@ -352,14 +352,17 @@ class CloudRecording(WrappedRecording):
             one.packets.reshape(-1),
             np.arange(count) * size,
             np.full(count, size),
-            np.full(count, self._number(one.stream)),
+            np.full(count, self._number(one)),
             np.full(count, one.message.host_ns),
             place=one.place,
             content_key=one.content_key,
         )
 
-    def _number(self, stream: Stream) -> int:
-        """Number of a stream; its packets have no receive time of their own."""
-        number = self.streams.number(stream)
+    def _number(self, one: _Packed) -> int:
+        """Number of the stream of a cloud; its packets have no receive time of their own."""
+        number = self.streams.number(one.stream)
         self.streams.untimed.add(number)
+        ends = np.ascontiguousarray(one.packets[[0, -1], : HEAD.itemsize]).view(HEAD)["stamp_ns"]
+        span_ns = abs(int(ends[1, 0]) - int(ends[0, 0]))
+        self.streams.message_ns[number] = max(span_ns, self.streams.message_ns.get(number, 0))
         return number

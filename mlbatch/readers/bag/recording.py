@@ -188,6 +188,8 @@ class _Unpacking:
         stream = streams.number(Stream(topic=topic.name))
         if found.untimed:
             streams.untimed.add(stream)
+        most = int(np.bincount(found.message).max())
+        streams.most_packets[stream] = max(most, streams.most_packets.get(stream, 0))
         return stream
 
     def _corrections(
