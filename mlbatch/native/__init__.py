@@ -1,13 +1,12 @@
 """Compiled loops for what numpy does in many passes: the engine `native`.
 
-C functions (`native.h`) over plain arrays, built when the package is installed and called through
-ctypes. Without a compiler the package works with numpy alone.
+C functions (`native.h`) over plain arrays, built when the package is installed
+(`.ci/build_library.py`) and called through ctypes.
 """
 
 from __future__ import annotations
 
 import os
-from importlib.machinery import EXTENSION_SUFFIXES
 from pathlib import Path
 
 from mlbatch.errors import UsageError
@@ -15,11 +14,7 @@ from mlbatch.errors import UsageError
 ENGINES = ("auto", "numpy", "native")
 # Names of earlier versions.
 ALIASES = {"numba": "native"}
-BUILD_ADVICE = (
-    "reinstall mlbatch where a C compiler is (Debian: apt-get install gcc; without administrator "
-    "rights see docs/howto/compiler.md)"
-)
-_STEM = "_native"
+BUILD_ADVICE = "reinstall mlbatch, which compiles it"
 
 
 def library_path() -> Path | None:
@@ -28,9 +23,8 @@ def library_path() -> Path | None:
     chosen = os.environ.get("MLBATCH_NATIVE", "")
     if chosen:
         return Path(chosen)
-    folder = Path(__file__).parent
-    paths = (folder / f"{_STEM}{suffix}" for suffix in EXTENSION_SUFFIXES)
-    return next((path for path in paths if path.is_file()), None)
+    path = Path(__file__).with_name("_native.so")
+    return path if path.is_file() else None
 
 
 def choose_engine(name: str) -> str:

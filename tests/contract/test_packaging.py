@@ -1,15 +1,19 @@
-"""Content of an installation, from pyproject.toml, without a build."""
+"""Content of an installation: pyproject.toml, and a wheel that is built here."""
 
 from __future__ import annotations
 
 import ast
-import fnmatch
 import importlib
 import re
+import runpy
+import shutil
+import subprocess
 import sys
+import zipfile
 from pathlib import Path
 from typing import TypeAlias, cast
 
+import pytest
 import yaml
 
 import mlbatch
@@ -18,6 +22,7 @@ from tests.contract.tree import PACKAGE, ROOT, modules
 Table: TypeAlias = dict[str, "Table | list[str] | str"]
 # Distributions whose module has another name.
 MODULE_OF = {"pyyaml": "yaml"}
+needs_compiler = pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler")
 
 
 def _settings(*keys: str) -> Table:
@@ -29,30 +34,54 @@ def _settings(*keys: str) -> Table:
     return table
 
 
-def test_the_types_travel_with_the_package() -> None:
-    data = _settings("tool", "setuptools", "package-data")
-    assert "py.typed" in data["mlbatch"]
-    assert (PACKAGE / "py.typed").is_file()
+@pytest.fixture(scope="module")
+def built(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The wheel, built by the project's own files from the files of the project."""
+    folder = tmp_path_factory.mktemp("wheel")
+    words = ["-m", "hatchling", "build", "-t", "wheel", "-d", str(folder)]
+    done = subprocess.run(
+        [sys.executable, *words], cwd=ROOT, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    (wheel,) = folder.glob("*.whl")
+    return wheel
 
 
-def test_every_asset_travels_with_the_package() -> None:
-    data = _settings("tool", "setuptools", "package-data")["mlbatch"]
-    assets = [path for suffix in ("css", "js") for path in PACKAGE.rglob(f"*.{suffix}")]
-    assert assets
-    assert {path.relative_to(PACKAGE).as_posix() for path in assets} <= set(data)
+@needs_compiler
+def test_a_wheel_has_every_module_and_asset_and_the_library(built: Path) -> None:
+    with zipfile.ZipFile(built) as archive:
+        names = {name for name in archive.namelist() if name.startswith("mlbatch/")}
+    suffixes = (".py", ".css", ".js", ".yaml", ".typed", ".html")
+    files = {
+        path for path in PACKAGE.rglob("*") if path.suffix in suffixes or path.name == "py.typed"
+    }
+    expected = {path.relative_to(ROOT).as_posix() for path in files}
+    assert names == expected | {"mlbatch/native/_native.so"}
 
 
-def test_every_package_is_found() -> None:
-    include = cast(list[str], _settings("tool", "setuptools", "packages", "find")["include"])
-    packages = {"mlbatch", *(f"mlbatch.{path.parent.name}" for path in PACKAGE.glob("*/*.py"))}
-    for package in packages:
-        assert any(fnmatch.fnmatch(package, pattern) for pattern in include), package
-    assert not any(fnmatch.fnmatch("tests", pattern) for pattern in include)
+@needs_compiler
+def test_a_wheel_is_for_every_python_of_its_platform(built: Path) -> None:
+    assert re.fullmatch(r"[\w.]+-[\w.]+-py3-none-\w+\.whl", built.name)
+
+
+def test_a_build_asks_for_a_compiler_only_where_none_is(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    hook = runpy.run_path(str(ROOT / ".ci" / "build_library.py"))
+    ask = hook["LibraryHook"].dependencies
+    monkeypatch.delenv("CC", raising=False)
+    monkeypatch.setenv("PATH", str(tmp_path))
+    assert ask(None) == ["ziglang>=0.13"]
+    (tmp_path / "gcc").write_text("#!/bin/sh\n")
+    (tmp_path / "gcc").chmod(0o755)
+    assert ask(None) == []
+    (tmp_path / "gcc").unlink()
+    monkeypatch.setenv("CC", "zig cc")
+    assert ask(None) == []
 
 
 def test_the_command_is_what_it_says() -> None:
     assert _settings("project", "scripts")["mlbatch"] == "mlbatch.cli:main"
-    assert _settings("tool", "setuptools", "dynamic")["version"] == {"attr": "mlbatch.__version__"}
     assert re.fullmatch(r"\d+\.\d+\.\d+", mlbatch.__version__)
 
 
@@ -102,7 +131,7 @@ def _top(node: ast.AST) -> str:
 
 def test_licence_and_readme_are_there() -> None:
     assert "MIT License" in Path(ROOT / "LICENSE").read_text(encoding="utf-8")
-    assert _settings("project")["license"] == {"file": "LICENSE"}
+    assert _settings("project")["license"] == "MIT"
     assert (ROOT / str(_settings("project")["readme"])).is_file()
 
 
@@ -129,15 +158,6 @@ def test_the_changelog_has_this_version() -> None:
     assert "## Unreleased\n" in changes
 
 
-def test_the_engine_is_built_from_all_its_sources() -> None:
-    """A missing one would fail quietly, since the extension is optional."""
-    (extension,) = cast(list[dict[str, list[str]]], _settings("tool", "setuptools")["ext-modules"])
-    native = PACKAGE / "native"
-    names = [path.relative_to(PACKAGE.parent).as_posix() for path in sorted(native.glob("*.c"))]
-    assert extension["sources"] == names
-    assert extension["depends"] == ["mlbatch/native/native.h"]
-
-
 def test_nothing_installs_the_package_of_others() -> None:
     """On PyPI `mlbatch` is another package; requirements and hints name the distribution."""
     assert _settings("project")["name"] == "mlbatch-lidar"
@@ -157,7 +177,7 @@ def test_nothing_installs_the_package_of_others() -> None:
 
 def test_every_extra_is_in_the_readme() -> None:
     """With the command that installs it from a clone."""
-    extras = set(_settings("project", "optional-dependencies")) - {"dev", "docs", "compiler"}
+    extras = set(_settings("project", "optional-dependencies")) - {"dev", "docs"}
     readme = (ROOT / "README.md").read_text(encoding="utf-8")
     assert "pip install '.[las]'" in readme
     assert extras <= set(re.findall(r"`(\w+)`", readme.partition("## Use")[0]))

@@ -141,4 +141,4 @@ def test_the_version_says_which_engine_is_used(monkeypatch: pytest.MonkeyPatch) 
     assert command("--version", "-v").out.splitlines()[1] == "engine native"
     monkeypatch.setattr(library, "trouble", lambda: "none")
     line = command("--version", "--verbose").out.splitlines()[1]
-    assert line.startswith("engine numpy; native: none; reinstall mlbatch where a C compiler is")
+    assert line.startswith("engine numpy; native: none; reinstall mlbatch, which compiles it")
