@@ -314,8 +314,11 @@ class _DecodedGroup:
         struct.step = table.step
         struct.run_count = len(runs[0])
         struct.runs = self._kept(np.array(runs, np.int64))
-        struct.word_count = len(layouts[0][0])
-        struct.word_bytes = self._kept(np.array(layouts[0][0], np.int64))
+        # Returns with fewer words read their first one again.
+        most = max(len(words) for words, _ in layouts)
+        words = [[*own, *own[:1] * (most - len(own))] for own, _ in layouts]
+        struct.word_count = most
+        struct.word_bytes = self._kept(np.array(words, np.int64))
         struct.fields = ctypes.addressof(structs)
         struct.scale = self._kept(np.array([table.factor, table.divisor], np.float32))
         struct.silent = table.silent
@@ -472,9 +475,8 @@ def _is_inside(lidar: Lidar, table: PixelTable) -> bool:
     """Return whether all pixels are inside of the records and of the channels."""
     if any(channel >= lidar.channels for channel in table.dark):
         return False
-    words = {tuple(_fields(layout)[0]) for layout in table.returns}
     runs = {len(layout.runs) for layout in table.returns}
-    if len(words) != 1 or len(runs) != 1 or len(next(iter(words))) > _MOST_WORDS:
+    if len(runs) != 1 or any(len(_fields(one)[0]) > _MOST_WORDS for one in table.returns):
         return False
     return all(_is_inside_return(lidar, table, layout) for layout in table.returns)
 

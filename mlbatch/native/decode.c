@@ -118,12 +118,12 @@ static void to_reflectivities(const uint32_t *restrict words, const Field *field
 static void read_words(const Group *group, const uint8_t *record, int64_t which, Planes *planes)
 {
     const int64_t *run = group->runs + which * group->run_count * 3;
+    const int64_t *bytes = group->word_bytes + which * group->word_count;
     for (int64_t word = 0; group->places && word < group->word_count; word++)
-        gather_at(record + group->word_bytes[word], group->places, group->slots,
-                  planes->words[word]);
+        gather_at(record + bytes[word], group->places, group->slots, planes->words[word]);
     for (int64_t number = 0; !group->places && number < group->run_count; number++, run += 3)
         for (int64_t word = 0; word < group->word_count; word++)
-            gather(record + run[0] + group->word_bytes[word], group->step, run[2],
+            gather(record + run[0] + bytes[word], group->step, run[2],
                    planes->words[word] + run[1]);
     const Field *distance = group->fields + which * FIELDS + DISTANCE;
     uint32_t *words = planes->words[distance->word];

@@ -77,7 +77,7 @@ typedef struct {
     int64_t run_count;
     const int64_t *runs; /* (returns, run_count, 3): first byte, first channel, channels */
     int64_t word_count;
-    const int64_t *word_bytes; /* (word_count,): first bytes in a pixel */
+    const int64_t *word_bytes; /* (returns, word_count): first bytes in a pixel */
     const Field *fields;       /* (returns, FIELDS) */
     const float *scale;        /* (2,): factor, divisor */
     int64_t silent;            /* distances up to this one are no return */
