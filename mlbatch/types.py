@@ -327,14 +327,6 @@ class ColumnHeaders:
     valid: BoolArray  # (P, C) True where the sensor reports the column as measured
 
 
-class Pixels(NamedTuple):
-    """Readings of n columns of one return: (n, channels) each."""
-
-    range_m: F32Array  # 0: no return
-    intensity: F32Array  # sensor units
-    reflectivity: U16Array | None  # None: the sensor has none
-
-
 @dataclass(frozen=True, slots=True)
 class SensorInfo:
     """A sensor as outputs describe it."""

@@ -146,9 +146,9 @@ def root(
 
 
 def _print_engine() -> None:
-    """Print which engine `auto` chooses, and why it is not the compiled one."""
+    """Print whether the compiled library can be used, and why not."""
     from mlbatch.native import BUILD_ADVICE
     from mlbatch.native.library import trouble
 
     why = trouble()
-    typer.echo(f"engine numpy; native: {why}; {BUILD_ADVICE}" if why else "engine native")
+    typer.echo(f"no compiled library: {why}; {BUILD_ADVICE}" if why else "engine native")

@@ -332,16 +332,7 @@ def _print_sensors(conversion: Conversion) -> None:
                 f"extrinsics from {sensor.detected.pose.describe()}"
             )
         )
-    engine = conversion.session.engine
-    why = "" if engine == "native" or conversion.job.engine == "numpy" else _why_not_native()
-    typer.echo(one_line(f"decoded by {engine}{why}"))
-
-
-def _why_not_native() -> str:
-    from mlbatch.native import BUILD_ADVICE
-    from mlbatch.native.library import trouble
-
-    return f" (native: {trouble()}; {BUILD_ADVICE})"
+    typer.echo(f"decoded by {conversion.session.engine}")
 
 
 # -- segments between clock steps -------------------------------------------------------------

@@ -1,23 +1,19 @@
-"""Columns of a window to the arrays of a scan; every pixel is written once, to its final row.
-
-Sensors with equal pixel layouts are decoded together, by numpy (`numpy_engine.py`) or by compiled
-loops (`native_engine.py`); both give the same bytes.
-"""
+"""Columns of a window to the arrays of a scan; every pixel is written once, to its final row."""
 
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from operator import sub
-from typing import NamedTuple, TypeAlias
+from typing import TypeAlias
 
 import numpy as np
 
 from mlbatch.arrays import F32Array, F64Array, U8Array
-from mlbatch.decode.engine import Engine, EngineSetup
-from mlbatch.decode.projector import Extras, Projector, Source, tile_columns
+from mlbatch.decode.engine import Engine
 from mlbatch.decode.scan_buffer import ScanBuffer, by_time
+from mlbatch.decode.source import Source
 from mlbatch.report.ledger import PointCounts
 from mlbatch.types import (
     EXTRAS,
@@ -53,37 +49,6 @@ class ScanHeader:
     own_times: bool = False
 
 
-class _EngineChoice(NamedTuple):
-    """How to make an engine.
-
-    joins_rotors: one projector may have several sensors whose columns have rotor words.
-    """
-
-    make: Callable[[EngineSetup], Engine]
-    joins_rotors: bool
-
-
-def _numpy_engine(setup: EngineSetup) -> Engine:
-    # Imported on demand: the other engine seldom needs it.
-    from mlbatch.decode.numpy_engine import NumpyEngine
-
-    return NumpyEngine(setup)
-
-
-def _native_engine(setup: EngineSetup) -> Engine:
-    # Imported on demand: the library may be missing.
-    from mlbatch.decode.native_engine import NativeEngine
-
-    return NativeEngine(setup)
-
-
-_ENGINES: Mapping[str, _EngineChoice] = {
-    "numpy": _EngineChoice(_numpy_engine, joins_rotors=True),
-    # Its groups join what its projectors do not; a compiled loop follows one rotor.
-    "native": _EngineChoice(_native_engine, joins_rotors=False),
-}
-
-
 class Decoder:
     """Decodes windows of columns into scans."""
 
@@ -92,17 +57,15 @@ class Decoder:
         info: RunInfo,
         sources: Sequence[Source],
         boxes_m: F64Array,
-        extras: Extras = EXTRAS,
+        extras: frozenset[str] = EXTRAS,
         only: int | None = None,
         buffers: int = 1,
-        engine: str = "numpy",
         record: RecordLayout | None = None,
     ) -> None:
         """boxes_m: (k, 6), as `Rig.exclude_boxes_m`; extras: optional arrays of the scans.
 
         only: with `--split` the index of the only sensor in `sources`; buffers: number of scans
-        whose arrays are valid at a time; engine: numpy or native; record: layout of the records
-        that the output takes, which an engine may pack.
+        whose arrays are valid at a time; record: layout of the records that the output takes.
         """
         self._info = info
         self._only = only
@@ -112,34 +75,16 @@ class Decoder:
         self._has_reflectivity = "reflectivity" in extras and any(
             source.lidar.has_reflectivity for source in sources
         )
-        choice = _ENGINES[engine]
-        columns = tile_columns(sources)
-        first_sensor = only or 0
-        groups = _groups(sources, choice.joins_rotors)
-        self._projectors = [
-            Projector(
-                [(first_sensor + number, sources[number]) for number in group],
-                columns,
-                boxes_m,
-                extras,
-            )
-            for group in groups
-        ]
-        self._seat = np.empty((len(sources), 2), np.int64)
-        for which, group in enumerate(groups):
-            self._seat[group] = [(which, member) for member in range(len(group))]
-        setup = EngineSetup(
-            projectors=self._projectors,
-            seat=self._seat,
-            tile_columns=columns,
-            first_sensor=first_sensor,
-            extras=extras if self._has_reflectivity else extras - {"reflectivity"},
+        self._engine = Engine(
+            sources,
+            boxes_m,
+            extras if self._has_reflectivity else extras - {"reflectivity"},
+            first_sensor=only or 0,
             organized_slots=self._slots if self._is_organized else 0,
             # Points are sorted by arrays.
             record=None if info.sort == "points" else record,
         )
-        self._engine = choice.make(setup)
-        self._counts = [self._projectors[which].counts[member] for which, member in self._seat]
+        self._counts = self._engine.counts
         self._buffer = self._new_buffer(0)
         # With `sort` the points before they are sorted; no scan has views of it.
         self._unsorted = self._new_buffer(0)
@@ -265,28 +210,3 @@ def _by_own_times(columns: WindowColumns, header: ScanHeader) -> WindowColumns:
     first_ns = np.array([one.first_ns for one in header.figures])
     stamp_ns = columns.stamp_ns - (first_ns - header.start_ns)[columns.sensor]
     return replace(columns, stamp_ns=stamp_ns)
-
-
-def _groups(sources: Sequence[Source], joins_rotors: bool) -> list[list[int]]:
-    """Group the sensors whose pixels one projector can decode; joins_rotors: `_EngineChoice`."""
-    groups: dict[tuple[str | int | bool | bytes, ...], list[int]] = {}
-    for number, source in enumerate(sources):
-        key: tuple[str | int | bool | bytes, ...] = source.lidar.pixel_layout
-        if source.lidar.beams.angle_rad is None:
-            key = (*key, *_firing(source)) if joins_rotors else (number,)
-        if source.lidar.projection(source.body_from_sensor, 1) is not None:
-            key = (number,)
-        groups.setdefault(key, []).append(number)
-    return list(groups.values())
-
-
-def _firing(source: Source) -> tuple[str | bool | bytes, ...]:
-    """Return what sensors with rotor words must share to be decoded together."""
-    lidar = source.lidar
-    return (
-        lidar.firing_ns.tobytes(),
-        lidar.channel.tobytes(),
-        lidar.typed_by,
-        lidar.sends_twice,
-        source.keep_repeated,
-    )

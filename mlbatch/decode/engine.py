@@ -1,42 +1,98 @@
-"""The interface of the engines that decode windows."""
+"""Decode the columns of a window by the compiled loops (`native/decode.c`), in one call."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import NamedTuple, Protocol
+import ctypes
+from collections.abc import Hashable, Sequence
+from typing import Any
 
-from mlbatch.arrays import I64Array
-from mlbatch.decode.projector import Extras, Projector
+import numpy as np
+import numpy.typing as npt
+
+from mlbatch.arrays import F32Array, F64Array, I64Array
+from mlbatch.decode.groups import CORRECTED, MIRRORED, TURNING, SensorGroup, group_key
 from mlbatch.decode.scan_buffer import ScanBuffer
-from mlbatch.types import RecordLayout, WindowColumns
+from mlbatch.decode.source import Source
+from mlbatch.lidar.geometry import angles_rad, rotor_angles
+from mlbatch.native.library import Group, Piece, Scan, address, library
+from mlbatch.report.ledger import PointCounts
+from mlbatch.types import PACKED_ROOM, RECORD_KINDS, RecordLayout, WindowColumns
+
+_UNSURE = np.float32(2)
+# Columns of an organized scan that are packed together: slots of several columns are adjacent in
+# the output, and all of them fit into the second-level cache.
+_NEAR_COLUMNS = 16
+# As in `native.h`.
+_SPARE_SLOTS = 4
+# Points beyond those of a column that the loops may overwrite.
+_SPARE_POINTS = 4
 
 
-class EngineSetup(NamedTuple):
-    """The sensors that an engine decodes, and the layout of their scans.
+class Engine:
+    """Decodes all sensors of a scan; its record layout, if there is one, is packed as well."""
 
-    seat: (sensors, 2) int64, index of the projector of each sensor, and its member there; -1: the
-    engine skips the sensor. tile_columns: most columns that a projector takes. first_sensor: index
-    of the first sensor in the scan. extras: optional arrays of the scan, of any sensor.
-    organized_slots: slots of a row of an organized scan; 0: scans are dense. record: layout of the
-    records that the output takes; None: it takes arrays.
-    """
+    def __init__(
+        self,
+        sources: Sequence[Source],
+        boxes_m: F64Array,
+        extras: frozenset[str],
+        *,
+        first_sensor: int = 0,
+        organized_slots: int = 0,
+        record: RecordLayout | None = None,
+    ) -> None:
+        """boxes_m: (k, 6); extras: optional arrays of the scan that some sensor has.
 
-    projectors: Sequence[Projector]
-    seat: I64Array
-    tile_columns: int
-    first_sensor: int
-    extras: Extras
-    organized_slots: int
-    record: RecordLayout | None = None
+        first_sensor: index of the first source in the scan; organized_slots: slots of a row of an
+        organized scan, 0: scans are dense; record: layout of the records that the output takes,
+        None: it takes arrays.
+        """
+        self.record = record
+        self._library = library()
+        self._extras = extras
+        # Of the last call; None: before the first.
+        self._out: ScanBuffer | None = None
+        self._group_of = np.zeros(len(sources), np.int64)
+        self._member_of = np.zeros(len(sources), np.int64)
+        by_key: dict[Hashable, list[int]] = {}
+        for number, source in enumerate(sources):
+            by_key.setdefault(group_key(source, number), []).append(number)
+        self._structs = (Group * len(by_key))()
+        self._groups: list[SensorGroup] = []
+        for which, numbers in enumerate(by_key.values()):
+            group = SensorGroup(
+                [(first_sensor + number, sources[number]) for number in numbers],
+                self._structs[which],
+                is_dense=not organized_slots,
+                has_reflectivity="reflectivity" in extras,
+            )
+            self._groups.append(group)
+            self._group_of[numbers] = which
+            self._member_of[numbers] = np.arange(len(numbers))
+        kinds = np.array([struct.kind for struct in self._structs])[self._group_of]
+        self._turns = np.isin(kinds, (TURNING, CORRECTED))
+        self._is_mirrored = kinds == MIRRORED
+        boxes = np.ascontiguousarray(boxes_m, np.float32)
+        self._arrays = (self._group_of, self._member_of, boxes)
+        self._scan = Scan(
+            group_of=address(self._group_of),
+            member_of=address(self._member_of),
+            group_count=len(by_key),
+            groups=ctypes.addressof(self._structs),
+            box_count=len(boxes),
+            boxes_m=address(boxes),
+            row_slots=organized_slots,
+        )
+        if record is not None:
+            self._set_record(record, max(source.slots for source in sources))
 
-
-class Engine(Protocol):
-    """Decodes windows of columns. All engines write the same bytes.
-
-    record: layout of the records that the engine packs; None: it writes arrays.
-    """
-
-    record: RecordLayout | None
+    @property
+    def counts(self) -> list[PointCounts]:
+        """Point counters of each sensor."""
+        return [
+            self._groups[group].counts[member]
+            for group, member in zip(self._group_of, self._member_of, strict=True)
+        ]
 
     def decode(
         self, columns: WindowColumns, start_ns: int, first_number: int, out: ScanBuffer
@@ -45,4 +101,106 @@ class Engine(Protocol):
 
         start_ns: start of the scan; first_number: number of the first column in the scan.
         """
-        ...
+        scan = self._scan
+        # The arrays are kept until the call returns: another thread may let a ring grow.
+        for group in self._groups:
+            group.use_rings()
+        self._use_outputs(out)
+        kept = self._use_columns(columns)
+        scan.start_ns = start_ns
+        scan.first_number = first_number
+        scan.first_row = 0
+        points = int(self._library.mlbatch_decode(ctypes.byref(scan)))
+        del kept
+        for group in self._groups:
+            group.add_counts()
+        return points
+
+    def _set_record(self, record: RecordLayout, slots: int) -> None:
+        """Have records packed from scratch arrays; slots: most of a column."""
+        is_organized = bool(self._scan.row_slots)
+        near = _NEAR_COLUMNS if is_organized else 1
+        pieces = [
+            Piece(RECORD_KINDS.index(one.kind), one.offset, one.source, one.bytes)
+            for one in record.pieces
+            # Without a sensor that has them, reflectivities are not decoded: they stay 0.
+            if one.kind != "reflectivity" or "reflectivity" in self._extras
+        ]
+        self._pieces = (Piece * len(pieces))(*pieces)
+        if is_organized:
+            self._near = ScanBuffer(near, self._scan.row_slots + _SPARE_SLOTS)
+        else:
+            self._near = ScanBuffer(slots + _SPARE_POINTS, None)
+        scan = self._scan
+        scan.record_bytes = record.step
+        scan.piece_count = len(pieces)
+        scan.pieces = ctypes.addressof(self._pieces)
+        scan.near_columns = near
+        kinds = [RECORD_KINDS[piece.kind] for piece in pieces]
+        self._set_arrays(self._near, "range_mm_u4" in kinds, "reflectivity" in kinds)
+
+    def _use_columns(self, columns: WindowColumns) -> list[npt.NDArray[Any]]:
+        """Point the struct to the columns; return the arrays to keep."""
+        kept: list[npt.NDArray[Any]] = [
+            np.ascontiguousarray(array, np.int64)
+            for array in (columns.stamp_ns, columns.sensor, columns.ring_index, columns.encoder)
+        ]
+        scan = self._scan
+        scan.columns = len(columns)
+        scan.stamp_ns, scan.sensor, scan.ring_index, scan.encoder = map(address, kept)
+        scan.moves = None
+        if columns.moves is not None:
+            moves = np.ascontiguousarray(columns.moves, np.float32)
+            scan.moves = address(moves)
+            kept.append(moves)
+        if self._turns.any() or self._is_mirrored.any():
+            angles = self._angles(kept[1], kept[3])
+            for group in self._groups:
+                if group.struct.kind in (TURNING, CORRECTED, MIRRORED):
+                    group.struct.cosine, group.struct.sine = map(address, angles)
+            kept += angles
+        return kept
+
+    def _angles(self, sensor: I64Array, encoder: I64Array) -> list[F32Array]:
+        """Return cosines and sines of all columns; undefined for sensors without rotor words."""
+        if self._turns.all():
+            return list(compiled_angles(encoder))
+        angles = np.zeros((2, len(encoder)), np.float32)
+        turning = self._turns[sensor]
+        angles[:, turning] = compiled_angles(encoder[turning])
+        for number in self._is_mirrored.nonzero()[0]:
+            own = sensor == number
+            angles[:, own] = self._groups[self._group_of[number]].mirror_angles(
+                angles_rad(encoder[own])
+            )
+        return [angles[0], angles[1]]
+
+    def _use_outputs(self, out: ScanBuffer) -> None:
+        """Point the struct to the arrays of a scan; organized rows are written as a whole."""
+        if out is self._out:
+            return
+        self._out = out
+        extras = self._extras
+        if self.record is not None:
+            self._scan.records = address(out.packed) + PACKED_ROOM
+            return
+        self._set_arrays(out, "range_m" in extras, "reflectivity" in extras)
+        wants_column = "column" in extras and not out.is_organized
+        self._scan.column = address(out.column) if wants_column else None
+
+    def _set_arrays(self, out: ScanBuffer, wants_range: bool, wants_reflectivity: bool) -> None:
+        scan = self._scan
+        scan.point = address(out.point)
+        scan.label = address(out.label)
+        scan.range_m = address(out.range_m) if wants_range else None
+        scan.reflectivity = address(out.reflectivity) if wants_reflectivity else None
+
+
+def compiled_angles(words: I64Array) -> tuple[F32Array, F32Array]:
+    """Return the result of `rotor_angles` for rotor words (n,), equal to the last bit."""
+    words = np.ascontiguousarray(words)
+    cosine, sine = np.empty((2, len(words)), np.float32)
+    if library().mlbatch_angles(len(words), address(words), address(cosine), address(sine)):
+        unsure = cosine == _UNSURE
+        cosine[unsure], sine[unsure] = rotor_angles(words[unsure])
+    return cosine, sine

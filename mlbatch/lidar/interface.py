@@ -7,10 +7,11 @@ from pathlib import Path
 from typing import NamedTuple, Protocol, runtime_checkable
 
 from mlbatch.arrays import BoolArray, F64Array, I64Array, U8Array
-from mlbatch.lidar.geometry import BeamTable, Projection
+from mlbatch.lidar.geometry import BeamTable
 from mlbatch.lidar.header_table import HeaderTable
 from mlbatch.lidar.pixel_table import PixelTable
-from mlbatch.types import ColumnHeaders, ImuSamples, Pixels, Stream
+from mlbatch.lidar.projections import Projection
+from mlbatch.types import ColumnHeaders, ImuSamples, Stream
 
 # Verdicts of `Lidar.faults`, in the order of their numbers; 0 is a good packet.
 FAULTS = ("", "bad_size", "bad_header", "bad_crc")
@@ -136,12 +137,8 @@ class Lidar(Protocol):
     lit_share: float | None
     # Positions of the columns in a packet.
     records: Records
-    # Equal for sensors whose records `read` decodes in the same way.
-    pixel_layout: tuple[str | int | bool, ...]
-    # The layout for compiled decoding; None: only `read` decodes it.
+    # Readings of the pixels of a record; None: it has coordinates (`projection`).
     pixels: PixelTable | None
-    # Whether records have coordinates instead of readings: compiled loops read them as well.
-    has_places: bool
     # Layout of the headers for compiled loops; None: only numpy reads them.
     headers: HeaderTable | None
     # The sequence number wraps there; 0: packets have none.
@@ -212,10 +209,6 @@ class Lidar(Protocol):
         """
         ...
 
-    def read(self, records: U8Array, which: int, out: Pixels) -> None:
-        """Decode return `which` of n columns (n, records.size) into `out`."""
-        ...
-
     def is_imu(self, size: int) -> bool:
         """Return whether a payload of this size on the sensor's streams is an IMU packet."""
         ...
@@ -228,9 +221,6 @@ class Lidar(Protocol):
         """Return the pose of the IMU in the sensor frame, (4, 4), m; None: no IMU packets."""
         ...
 
-    def projection(self, body_from_sensor: F64Array, columns: int) -> Projection | None:
-        """Return the projection of a sensor that `beams` cannot describe; else None.
-
-        columns: most columns of a call of `Projection.prepare`.
-        """
+    def projection(self, body_from_sensor: F64Array) -> Projection | None:
+        """Return how ranges become points of a sensor that `beams` cannot describe; else None."""
         ...

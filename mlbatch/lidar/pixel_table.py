@@ -1,7 +1,4 @@
-"""Layouts of the pixels of a column as data, for compiled loops.
-
-`Lidar.read` decodes the same in numpy; tests compare the engines pixel by pixel.
-"""
+"""Layouts of the pixels of a column as data, which the compiled loops read."""
 
 from __future__ import annotations
 

@@ -28,21 +28,13 @@ def library_path() -> Path | None:
 
 
 def choose_engine(name: str) -> str:
-    """`numpy` or `native`; name: one of ENGINES, `auto` for native where it is installed.
+    """`numpy` or `native`: what reads headers and merges columns; name: one of ENGINES.
 
-    Raises UsageError if native is name and cannot be loaded.
+    Points are always decoded by the compiled library: UsageError if it cannot be loaded.
     """
-    name = ALIASES.get(name, name)
-    if name == "numpy":
-        return name
     from mlbatch.native.library import trouble
 
     why = trouble()
-    if not why:
-        return "native"
-    if name == "auto":
-        return "numpy"
-    raise UsageError(
-        f"--engine native: expected its compiled library, found {why}; {BUILD_ADVICE}, or leave "
-        "the option out"
-    )
+    if why:
+        raise UsageError(f"expected the compiled library of mlbatch, found {why}; {BUILD_ADVICE}")
+    return "numpy" if ALIASES.get(name, name) == "numpy" else "native"

@@ -1,7 +1,6 @@
 /* Columns of a window to points of a scan: every pixel is read once and written to its final row.
 
-   The same float32 operations as `decode/projector.py` and `lidar/geometry.py`, column by column.
-   A column is decoded to planes, one value a beam, which fit into the first cache; an element is
+   Formulas: `lidar/geometry.py`, `lidar/projections.py`. A column is decoded to planes, one value a beam, which fit into the first cache; an element is
    `return * width + beam`. Beams beyond those of the lidar have no return. */
 #include <math.h>
 #include <string.h>
@@ -188,7 +187,7 @@ static void project_tabled(const Group *group, int64_t member, int64_t encoder, 
     }
 }
 
-/* cos * V1 + sin * V2 + V3 of one axis; as in numpy, vectors that are zero are left out. */
+/* cos * V1 + sin * V2 + V3 of one axis; vectors that are zero are left out. */
 static void combine(const float *restrict vectors, int64_t width, int64_t used,
                     const float *restrict cosine, const float *restrict sine, float *restrict out)
 {
@@ -213,6 +212,31 @@ static float speed_of(int64_t encoder)
     const int64_t field = encoder >> SPEED_BIT & (2 * SPEED_SIGN - 1);
     /* The constant is 2 pi / 2**48 as Python computes it. */
     return (float)((double)((field ^ SPEED_SIGN) - SPEED_SIGN) * (0x1p-48 * 2 * 3.141592653589793));
+}
+
+/* Square roots of a multiple of four numbers; all compilers round them correctly. */
+static void take_roots(float *values, int64_t count)
+{
+#if defined(__SSE2__)
+    for (int64_t at = 0; at < count; at += 4)
+        _mm_storeu_ps(values + at, _mm_sqrt_ps(_mm_loadu_ps(values + at)));
+#else
+    for (int64_t at = 0; at < count; at++)
+        values[at] = sqrtf(values[at]);
+#endif
+}
+
+/* Points so near that they are projected from the axis. */
+static void place_near(const float *axis_m, const float *range_m,
+                       float (*direction)[MOST_BEAMS], int64_t width, float *x, float *y, float *z)
+{
+    const float nearest_m = 0.09f;
+    for (int64_t beam = 0; beam < width; beam++)
+        if (range_m[beam] > 0.0f && range_m[beam] <= nearest_m) {
+            x[beam] = range_m[beam] * direction[0][beam] + axis_m[0];
+            y[beam] = range_m[beam] * direction[1][beam] + axis_m[1];
+            z[beam] = range_m[beam] * direction[2][beam] + axis_m[2];
+        }
 }
 
 /* Turning: each beam fires at its own angle of the rotor. */
@@ -246,6 +270,15 @@ static void project_turning(const Group *group, int64_t member, int64_t encoder,
     }
     for (int64_t which = 0; which < group->returns; which++) {
         const float *restrict range_m = planes->range_m + which * width;
+        if (group->miss_m2) {
+            const float *restrict miss_m2 = group->miss_m2 + member * width;
+            for (int64_t beam = 0; beam < width; beam++) {
+                const float behind_m2 = range_m[beam] * range_m[beam] - miss_m2[beam];
+                sine[beam] = behind_m2 > 0.0f ? behind_m2 : 0.0f;
+            }
+            take_roots(sine, width);
+            range_m = sine;
+        }
         if (group->reach) {
             const float *restrict reach = group->reach + member * width;
             for (int64_t beam = 0; beam < width; beam++)
@@ -260,19 +293,157 @@ static void project_turning(const Group *group, int64_t member, int64_t encoder,
             y[beam] = range_m[beam] * direction[1][beam] + origin[1][beam];
             z[beam] = range_m[beam] * direction[2][beam] + origin[2][beam];
         }
+        if (group->miss_m2)
+            place_near(group->axis_m + 3 * member, planes->range_m + which * width, direction,
+                       width, x, y, z);
     }
 }
 
-/* Square roots of a multiple of four numbers; all compilers round them correctly. */
-static void take_roots(float *values, int64_t count)
+/* Corrected: the correction of a range depends on the position of the point (docs/sources/
+   velodyne.md section 10): interpolated below 25.04 m, for each axis. */
+static void project_corrected(const Group *group, int64_t encoder, int64_t table, int64_t column,
+                              Planes *planes)
 {
-#if defined(__SSE2__)
-    for (int64_t at = 0; at < count; at += 4)
-        _mm_storeu_ps(values + at, _mm_sqrt_ps(_mm_loadu_ps(values + at)));
-#else
-    for (int64_t at = 0; at < count; at++)
-        values[at] = sqrtf(values[at]);
-#endif
+    const float far_m = 25.04f;
+    const int64_t width = group->width;
+    const float *plane = group->planes, *pose = group->pose;
+    const float *firing_ns = group->firing_ns + table * width;
+    const float speed = speed_of(encoder);
+    const float cosine = group->cosine[column], sine = group->sine[column];
+    for (int64_t beam = 0; beam < width; beam++) {
+        const float *own = plane + beam;
+        const float turn_cosine = own[TURN_COSINE * width], turn_sine = own[TURN_SINE * width];
+        const float first_cosine = cosine * turn_cosine + sine * turn_sine;
+        const float first_sine = sine * turn_cosine - cosine * turn_sine;
+        const float turned = speed * firing_ns[beam];
+        const float half = turned * 0.5f;
+        const float ahead = first_cosine - turned * (first_sine + half * first_cosine);
+        const float aside = first_sine + turned * (first_cosine - half * first_sine);
+        const float flat = own[FLAT * width];
+        for (int64_t which = 0; which < group->returns; which++) {
+            const int64_t element = which * width + beam;
+            const float range_m = planes->range_m[element];
+            const float far = range_m + own[FAR_M * width];
+            float right_m = far, forward_m = far, up_m = far;
+            if (range_m < far_m) {
+                const float flat_m = far * flat;
+                const float by_right = own[RIGHT_M * width]
+                    + own[RIGHT_SLOPE * width] * fabsf(flat_m * aside);
+                const float by_forward = own[FORWARD_M * width]
+                    + own[FORWARD_SLOPE * width] * fabsf(flat_m * ahead);
+                right_m = range_m + by_right;
+                forward_m = range_m + by_forward;
+                up_m = range_m + (by_right + by_forward) * 0.5f;
+            }
+            const float right = right_m * flat * aside - own[ASIDE_M * width] * ahead;
+            const float forward = forward_m * flat * ahead + own[ASIDE_M * width] * aside;
+            const float up = up_m * own[UP * width] + own[ABOVE_M * width];
+            planes->x[element] = pose[0] * forward - pose[1] * right + pose[2] * up + pose[3];
+            planes->y[element] = pose[4] * forward - pose[5] * right + pose[6] * up + pose[7];
+            planes->z[element] = pose[8] * forward - pose[9] * right + pose[10] * up + pose[11];
+        }
+    }
+}
+
+/* Rotate a direction by a small angle, below 0.05 rad: the next terms are d**5 / 120. */
+static inline void rotate(float *cosine, float *sine, float more)
+{
+    const float square = more * more;
+    const float by_sine = (square * (float)(-1.0 / 6) + 1.0f) * more;
+    const float by_cosine = (square * (float)(1.0 / 24) - 0.5f) * square + 1.0f;
+    const float before = *cosine;
+    *cosine = before * by_cosine - *sine * by_sine;
+    *sine = *sine * by_cosine + before * by_sine;
+}
+
+/* Mirrored: a beam leaves at twice the angle of the rotor past the start of its mirror, whose
+   cosine and sine are those of the column, and is corrected by tables over the rotor angle
+   (docs/sources/hesai.md section 6). */
+static void project_mirrored(const Group *group, int64_t encoder, int64_t table, int64_t column,
+                             Planes *planes)
+{
+    const double revolution = 2 * 3.141592653589793;
+    const int64_t width = group->width, cells = group->steps * group->beams;
+    const float *plane = group->planes, *pose = group->pose;
+    const float *firing_ns = group->firing_ns + table * width;
+    const float speed = speed_of(encoder);
+    const double steps_per_rad = (double)group->steps / revolution;
+    const double angle = (double)(encoder & 0xFFFFFFFF) * (revolution / 4294967296.0);
+    const double step = floor(angle * steps_per_rad);
+    const float within = (float)(angle * steps_per_rad - step);
+    for (int64_t beam = 0; beam < group->beams; beam++) {
+        const float turned = speed * firing_ns[beam];
+        /* While a column is fired, beams may enter the next or the previous cell. */
+        float part = turned * (float)steps_per_rad + within;
+        const float further = floorf(part);
+        part -= further;
+        int64_t cell = (((int64_t)further + (int64_t)step) * group->beams + beam) % cells;
+        cell = cell < 0 ? cell + cells : cell;
+        const float *own = plane + beam;
+        const float azimuth_cosine = own[AZIMUTH_COSINE * width];
+        const float azimuth_sine = own[AZIMUTH_SINE * width];
+        const float past_cosine = group->cosine[column], past_sine = group->sine[column];
+        float cosine = past_cosine * azimuth_cosine - past_sine * azimuth_sine;
+        float sine = past_sine * azimuth_cosine + past_cosine * azimuth_sine;
+        rotate(&cosine, &sine,
+               group->azimuth_slope[cell] * part + group->azimuth_value[cell] + 2.0f * turned);
+        float flat = own[ELEVATION_COSINE * width], up = own[ELEVATION_SINE * width];
+        rotate(&flat, &up, group->elevation_slope[cell] * part + group->elevation_value[cell]);
+        const float right = flat * sine, forward = flat * cosine;
+        for (int64_t axis = 0; axis < 3; axis++) {
+            float *out = axis == 0 ? planes->x : axis == 1 ? planes->y : planes->z;
+            const float *row = pose + 4 * axis;
+            const float towards = right * row[0] + row[1] * forward + row[2] * up;
+            for (int64_t which = 0; which < group->returns; which++) {
+                const int64_t element = which * width + beam;
+                out[element] = planes->range_m[element] * towards + row[3];
+            }
+        }
+    }
+}
+
+static inline double sine_of(const Group *group, int64_t angle_cdeg)
+{
+    return (double)group->sines[angle_cdeg % 36000];
+}
+
+/* Coordinates: the one point of a record, as integers; one return after the other. */
+static void read_coordinates(const Group *group, int64_t member, const uint8_t *record,
+                             Planes *planes)
+{
+    const double *pose = group->pose_f8 + 12 * member;
+    memset(planes->range_m, 0, (size_t)(group->returns * group->width) * sizeof(float));
+    for (int64_t which = 0; which < group->returns; which++, record += group->step) {
+        const int64_t element = which * group->width;
+        double x, y, z, range_m;
+        if (group->coordinates == SPHERICAL_MM) {
+            uint32_t depth;
+            uint16_t angles[2];
+            memcpy(&depth, record, sizeof depth);
+            memcpy(angles, record + 4, sizeof angles);
+            range_m = depth / 1000.0;
+            const double flat_m = range_m * sine_of(group, angles[0]);
+            z = range_m * sine_of(group, angles[0] + 9000);
+            x = flat_m * sine_of(group, angles[1] + 9000);
+            y = flat_m * sine_of(group, angles[1]);
+        } else {
+            int32_t wide[3];
+            int16_t narrow[3];
+            const int is_wide = group->coordinates == INT32_MM;
+            memcpy(wide, record, is_wide ? sizeof wide : 0);
+            memcpy(narrow, record, sizeof narrow);
+            const double unit = is_wide ? 1000.0 : 100.0;
+            x = (is_wide ? wide[0] : narrow[0]) / unit;
+            y = (is_wide ? wide[1] : narrow[1]) / unit;
+            z = (is_wide ? wide[2] : narrow[2]) / unit;
+            range_m = sqrt(x * x + y * y + z * z);
+        }
+        planes->range_m[element] = (float)range_m;
+        planes->level[element] = (float)record[group->runs[0]];
+        planes->x[element] = (float)(x * pose[0] + y * pose[1] + z * pose[2] + pose[3]);
+        planes->y[element] = (float)(x * pose[4] + y * pose[5] + z * pose[6] + pose[7]);
+        planes->z[element] = (float)(x * pose[8] + y * pose[9] + z * pose[10] + pose[11]);
+    }
 }
 
 /* Placed: points that a driver computed, rotated and shifted. */
@@ -356,7 +527,7 @@ static void mark(const Scan *scan, const Group *group, int64_t member, Planes *p
     counts[OUTSIDE_BOXES] += left;
 }
 
-/* Move the points of a column by a transform (3, 4), in the order of operations of numpy. */
+/* Move the points of a column by a transform (3, 4). */
 static void move_planes(const float *restrict moves, int64_t elements, Planes *planes)
 {
     float *restrict x = planes->x;
@@ -1110,25 +1281,10 @@ static void prefetch_column(const Scan *scan, int64_t column)
     if (column >= scan->columns)
         return;
     const int64_t number = scan->group_of[scan->sensor[column]];
-    if (number < 0 || scan->groups[number].kind == COPIED)
+    if (number < 0)
         return;
     const Group *group = scan->groups + number;
     prefetch(record_of(scan, group, column), group->step * group->beams);
-}
-
-/* Copy the points that numpy decoded of a column. Return the next row. */
-static int64_t copy_column(const Scan *scan, const Group *group, int64_t column, int64_t row)
-{
-    const int64_t from = *group->cursor;
-    const size_t count = (size_t)group->points[column];
-    memcpy(scan->point + 4 * row, group->copied_point + 4 * from, 16 * count);
-    memcpy(scan->label + row, group->copied_label + from, 8 * count);
-    if (scan->range_m)
-        memcpy(scan->range_m + row, group->copied_range + from, 4 * count);
-    if (scan->reflectivity)
-        memcpy(scan->reflectivity + row, group->copied_reflectivity + from, 2 * count);
-    *group->cursor += group->points[column];
-    return row + group->points[column];
 }
 
 static int64_t decode_column(const Scan *scan, const Group *group, int64_t member, int64_t column,
@@ -1148,14 +1304,17 @@ static int64_t decode_column(const Scan *scan, const Group *group, int64_t membe
     if (fits_places(scan, group))
         return decode_placed(scan, group, member, column, known, record, row);
 #endif
-    for (int64_t which = 0; which < group->returns && group->kind != PLACED; which++)
+    const int has_pixels = group->kind != PLACED && group->kind != COORDINATES;
+    for (int64_t which = 0; which < group->returns && has_pixels; which++)
         read_return(group, record, which, planes);
-    if (group->kind == PLACED)
-        read_placed(group, member, record, planes);
-    else if (group->kind == TABLED)
-        project_tabled(group, member, encoder, planes);
-    else
-        project_turning(group, member, encoder, known, column, planes);
+    switch (group->kind) {
+    case PLACED: read_placed(group, member, record, planes); break;
+    case COORDINATES: read_coordinates(group, member, record, planes); break;
+    case CORRECTED: project_corrected(group, encoder, known, column, planes); break;
+    case MIRRORED: project_mirrored(group, encoder, known, column, planes); break;
+    case TABLED: project_tabled(group, member, encoder, planes); break;
+    default: project_turning(group, member, encoder, known, column, planes);
+    }
     mark(scan, group, member, planes);
     if (scan->moves)
         move_planes(scan->moves + 12 * column, group->returns * group->width, planes);
@@ -1173,24 +1332,13 @@ static int64_t decode_column(const Scan *scan, const Group *group, int64_t membe
 
 /* -- packed records ----------------------------------------------------------------------------- */
 
-/* Decode or copy a column of a dense scan to packed records. Return the next row. */
+/* Decode a column of a dense scan to packed records. Return the next row. */
 static int64_t pack_column(const Scan *scan, const Group *group, int64_t member, int64_t column,
                            int64_t row, Planes *planes)
 {
-    Rows rows = {scan->point, scan->label, scan->range_m, scan->reflectivity, 1};
-    int64_t count;
-    if (group->kind == COPIED) {
-        const int64_t from = *group->cursor;
-        count = group->points[column];
-        rows.point = group->copied_point + 4 * from;
-        rows.label = group->copied_label + from;
-        rows.range_m = group->copied_range + from;
-        rows.reflectivity = group->copied_reflectivity + from;
-        *group->cursor += count;
-    } else {
-        count = decode_column(scan, group, member, column, record_of(scan, group, column), 0,
-                              planes);
-    }
+    const Rows rows = {scan->point, scan->label, scan->range_m, scan->reflectivity, 1};
+    const int64_t count = decode_column(scan, group, member, column,
+                                        record_of(scan, group, column), 0, planes);
     mlbatch_pack(scan, &rows, count, scan->records + row * scan->record_bytes);
     return row + count;
 }
@@ -1212,18 +1360,14 @@ EXPORT int64_t mlbatch_decode(const Scan *scan)
             continue;
         const Group *group = scan->groups + number;
         const int64_t first = row;
-        if (group->kind != COPIED) {
-            if (number != last_group && last_group >= 0) {
-                /* What another group left in beams that this one does not have. */
-                memset(planes.words, 0, sizeof planes.words);
-                memset(planes.reflectivity, 0, sizeof planes.reflectivity);
-            }
-            last_group = number;
+        if (number != last_group && last_group >= 0) {
+            /* What another group left in beams that this one does not have. */
+            memset(planes.words, 0, sizeof planes.words);
+            memset(planes.reflectivity, 0, sizeof planes.reflectivity);
         }
+        last_group = number;
         if (scan->records && !scan->row_slots)
             row = pack_column(scan, group, scan->member_of[sensor], column, row, &planes);
-        else if (group->kind == COPIED)
-            row = copy_column(scan, group, column, row);
         else
             row = decode_column(scan, group, scan->member_of[sensor], column,
                                 record_of(scan, group, column), row, &planes);

@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from mlbatch.native import library_path
 
-_ABI = 8
+_ABI = 10
 _WORD = ctypes.c_int64
 _ADDRESS = ctypes.c_void_p
 _NUMBER = ctypes.c_double
@@ -112,6 +112,18 @@ class Group(ctypes.Structure):
         ("tables", _WORD),
         ("cosine", _ADDRESS),
         ("sine", _ADDRESS),
+        ("miss_m2", _ADDRESS),
+        ("axis_m", _ADDRESS),
+        ("planes", _ADDRESS),
+        ("pose", _ADDRESS),
+        ("azimuth_value", _ADDRESS),
+        ("azimuth_slope", _ADDRESS),
+        ("elevation_value", _ADDRESS),
+        ("elevation_slope", _ADDRESS),
+        ("steps", _WORD),
+        ("coordinates", _WORD),
+        ("pose_f8", _ADDRESS),
+        ("sines", _ADDRESS),
         ("slots", _WORD),
         ("labels", _ADDRESS),
         ("order", _ADDRESS),
@@ -123,12 +135,6 @@ class Group(ctypes.Structure):
         ("drops_repeated", _WORD),
         ("limits_m", _ADDRESS),
         ("counts", _ADDRESS),
-        ("points", _ADDRESS),
-        ("cursor", _ADDRESS),
-        ("copied_point", _ADDRESS),
-        ("copied_label", _ADDRESS),
-        ("copied_range", _ADDRESS),
-        ("copied_reflectivity", _ADDRESS),
     ]
 
 

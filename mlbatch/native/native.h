@@ -1,10 +1,10 @@
-/* Interface of the engine `native`: plain C11 functions, called through ctypes.
+/* Interface of the compiled library: plain C11 functions, called through ctypes.
 
-   `library.py` and `decode/native_engine.py` mirror the structs below, member by member: all
+   `library.py` and `decode/groups.py` mirror the structs below, member by member: all
    members are 8 bytes, so that there is no padding. Arrays are C-contiguous and belong to the
    caller; no function allocates, keeps a pointer, or checks what its caller guarantees.
-   Floating point: float32 operations in the order of the numpy code, no contraction, so that both
-   engines give the same bytes. */
+   Floating point: float32 operations in a fixed order, no contraction, so that every compiler and
+   processor gives the same bytes. */
 #ifndef MLBATCH_NATIVE_H
 #define MLBATCH_NATIVE_H
 
@@ -12,11 +12,11 @@
 #include <string.h>
 
 #if defined(__BYTE_ORDER__) && __BYTE_ORDER__ != __ORDER_LITTLE_ENDIAN__
-#error "the engine native reads little-endian words"
+#error "the compiled library reads little-endian words"
 #endif
 
 /* To be changed with every change of a struct or of a signature. */
-#define MLBATCH_ABI 8
+#define MLBATCH_ABI 10
 
 #if defined(_WIN32)
 #define EXPORT __declspec(dllexport)
@@ -59,16 +59,39 @@ typedef struct {
 
 enum { DISTANCE, INTENSITY, REFLECTIVITY, FIELDS };
 
-enum { TABLED, TURNING, COPIED, PLACED };
+enum { TABLED, TURNING, PLACED, CORRECTED, MIRRORED, COORDINATES };
+
+/* Integers of COORDINATES. */
+enum { INT32_MM, INT16_CM, SPHERICAL_MM };
 
 enum { NOT_TYPED, TYPED_BY_ORDER, TYPED_BY_LEVEL };
+
+/* Planes of CORRECTED, one value a beam: cosine and sine of the angle on the rotor and above it,
+   offsets, and three ranges: correction far, and value at 0 m and slope aside and ahead. */
+enum {
+    TURN_COSINE,
+    TURN_SINE,
+    FLAT,
+    UP,
+    ASIDE_M,
+    ABOVE_M,
+    FAR_M,
+    RIGHT_M,
+    RIGHT_SLOPE,
+    FORWARD_M,
+    FORWARD_SLOPE,
+    CORRECTIONS
+};
+
+/* Planes of MIRRORED: cosine and sine of azimuth and elevation. */
+enum { AZIMUTH_COSINE, AZIMUTH_SINE, ELEVATION_COSINE, ELEVATION_SINE, MIRRORS };
 
 /* Slots of a member that are left after each step, and its columns. */
 enum { COLUMNS, FOUND, DISTINCT, IN_RANGE, OUTSIDE_BOXES, COUNTS };
 
 /* Sensors that are decoded alike (the members). E: elements, returns * width; T: firing tables. */
 typedef struct {
-    int64_t kind; /* TABLED, TURNING, COPIED, PLACED */
+    int64_t kind;
     int64_t beams;
     int64_t width; /* beams, rounded up to a multiple of 16 */
     int64_t returns;
@@ -106,6 +129,26 @@ typedef struct {
     int64_t tables;         /* T */
     const float *cosine;
     const float *sine;
+    /* TURNING whose ranges count from the axis, not from the optical centre: squares of the
+       distances at which beams pass the axis (members, width), m2; NULL: others. Axis: origins of
+       near points (members, 3). */
+    const float *miss_m2;
+    const float *axis_m;
+    /* CORRECTED: planes of CORRECTIONS (width,); MIRRORED: planes of MIRRORS (width,). One member,
+       whose pose is (3, 4), row by row. */
+    const float *planes;
+    const float *pose;
+    /* MIRRORED: corrections over the rotor angle, (steps, beams): value and slope. */
+    const float *azimuth_value;
+    const float *azimuth_slope;
+    const float *elevation_value;
+    const float *elevation_slope;
+    int64_t steps;
+    /* COORDINATES: integers of one point in a record; pose (members, 3, 4); sines of whole
+       hundredths of a degree (36000,). */
+    int64_t coordinates;
+    const double *pose_f8;
+    const float *sines;
     /* Slots. */
     int64_t slots;
     const int64_t *labels; /* (members * T, E): words of 8 bytes, time 0 */
@@ -119,14 +162,6 @@ typedef struct {
     int64_t drops_repeated;
     const float *limits_m; /* (members, 2) or NULL */
     int64_t *counts;       /* (members, COUNTS), added to */
-    /* COPIED: what numpy decoded; points (columns of the scan,) of each column; cursor: row of the
-       next point there, moved on. */
-    const int64_t *points;
-    int64_t *cursor;
-    const float *copied_point;
-    const int64_t *copied_label;
-    const float *copied_range;
-    const uint16_t *copied_reflectivity;
 } Group;
 
 /* Kinds of `Piece`: bytes of the arrays of a scan, and values computed from them, as in

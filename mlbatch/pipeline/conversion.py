@@ -185,7 +185,7 @@ class Conversion:
         sources = with_own_lidars([sensor.source() for sensor in self.sensors])
         boxes_m = self.session.boxes_m
         extras = frozenset({"column"})
-        return Decoder(info, sources, boxes_m, extras, engine=self.session.engine)
+        return Decoder(info, sources, boxes_m, extras)
 
     # -- the loop -----------------------------------------------------------------------------
 
@@ -318,7 +318,6 @@ class Conversion:
                 job.extras,
                 only,
                 self._buffers,
-                self.session.engine,
                 job.record,
             )
 

@@ -43,7 +43,7 @@ _CALIBRATED = (
     "packet_size",
     "columns_per_packet",
     "records",
-    "pixel_layout",
+    "pixels",
     "channel",
     "firing_ns",
     "beams",

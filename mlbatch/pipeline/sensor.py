@@ -12,7 +12,7 @@ from mlbatch.clocks.timescale import timescale
 from mlbatch.clocks.watch import ClockWatch
 from mlbatch.decode.arena_ring import ArenaRing
 from mlbatch.decode.packet_ring import PacketRing
-from mlbatch.decode.projector import Source
+from mlbatch.decode.source import Source
 from mlbatch.discovery.types import DetectedSensor
 from mlbatch.lidar.interface import Lidar
 from mlbatch.native.arena import PacketArena
@@ -155,10 +155,7 @@ def header_loops(lidar: Lidar, engine: str) -> HeaderLoops | None:
 
 
 def new_ring(lidar: Lidar, arena: PacketArena | None = None) -> PacketRing | ArenaRing:
-    """An empty ring for the packets of a lidar; arena: into which the recording is read, or None.
-
-    What numpy decodes is copied, since it gathers records, which are then close to each other.
-    """
-    if arena is None or (lidar.pixels is None and not lidar.has_places):
+    """An empty ring for packets of a lidar; arena: into which the recording is read, or None."""
+    if arena is None:
         return PacketRing(lidar.packet_size, lidar.records)
     return ArenaRing(lidar.packet_size, lidar.records, lidar.header_bytes, arena)

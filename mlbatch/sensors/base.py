@@ -6,10 +6,11 @@ import numpy as np
 
 from mlbatch.arrays import BoolArray, F64Array, I64Array, U8Array
 from mlbatch.lidar.content_keys import content_keys
-from mlbatch.lidar.geometry import BeamTable, Projection
+from mlbatch.lidar.geometry import BeamTable
 from mlbatch.lidar.header_table import HeaderTable
 from mlbatch.lidar.interface import Records
 from mlbatch.lidar.pixel_table import PixelTable
+from mlbatch.lidar.projections import Projection
 from mlbatch.types import ImuSamples
 from mlbatch.units import NS_PER_S
 
@@ -17,8 +18,8 @@ from mlbatch.units import NS_PER_S
 class BaseLidar:
     """Base class of the vendors' lidars.
 
-    A subclass assigns the attributes that are only declared here and implements `faults`,
-    `column_headers` and `read`.
+    A subclass assigns the attributes that are only declared here and implements `faults`
+    and `column_headers`.
     """
 
     vendor: str
@@ -29,7 +30,6 @@ class BaseLidar:
     packet_size: int
     columns_per_packet: int
     records: Records
-    pixel_layout: tuple[str | int | bool, ...]
     return_types: tuple[int, ...]
     channel: I64Array
     firing_ns: I64Array
@@ -37,7 +37,6 @@ class BaseLidar:
     calibration: str
 
     pixels: PixelTable | None = None
-    has_places: bool = False
     headers: HeaderTable | None = None
     serial: str = ""
     carries_serial: bool = False
@@ -86,6 +85,6 @@ class BaseLidar:
         """None: no IMU packets."""
         return None
 
-    def projection(self, body_from_sensor: F64Array, columns: int) -> Projection | None:
+    def projection(self, body_from_sensor: F64Array) -> Projection | None:
         """None: the beam vectors suffice."""
         return None

@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 
 from mlbatch.arrays import F32Array, I64Array, U8Array
-from mlbatch.lidar.geometry import Turning
 from mlbatch.lidar.interface import Calibration, Evidence, Lidar
 from mlbatch.sensors.hesai import sensor as hesai
-from mlbatch.types import ColumnHeaders, Pixels, Stream
+from mlbatch.types import ColumnHeaders, Stream
+from tests.builders.decoded import Readings, readings
 
 STREAM = Stream("192.168.1.201", 2368)
 EVIDENCE_PACKETS = 16
@@ -20,20 +20,30 @@ EVIDENCE_PACKETS = 16
 
 @dataclass(frozen=True)
 class Decoded:
-    """All columns of some packets: (n, channels, returns) ranges and levels."""
+    """All columns of some packets."""
 
     lidar: Lidar
-    headers: ColumnHeaders
-    range_m: F32Array
-    intensity: F32Array
+    readings: Readings
+
+    @property
+    def range_m(self) -> F32Array:
+        return self.readings.range_m
+
+    @property
+    def intensity(self) -> F32Array:
+        return self.readings.intensity
+
+    @property
+    def headers(self) -> ColumnHeaders:
+        return self.readings.headers
 
     @property
     def stamp_ns(self) -> I64Array:
-        return self.headers.stamp_ns.reshape(-1)
+        return self.readings.stamp_ns
 
     @property
     def encoder(self) -> I64Array:
-        return self.headers.encoder.reshape(-1)
+        return self.readings.encoder
 
     @property
     def time_ns(self) -> I64Array:
@@ -44,15 +54,7 @@ class Decoded:
 
     def xyz(self) -> F32Array:
         """(n, channels, returns, 3) points in the sensor frame, as conversions make them."""
-        count, channels, returns = self.range_m.shape
-        projection = self.lidar.projection(np.eye(4), count) or Turning(
-            self.lidar.beams, np.maximum(self.lidar.firing_ns, 0), count
-        )
-        points = np.empty((count, channels, returns, 3), np.float32)
-        projection.prepare(np.zeros(count, np.int64), self.encoder)
-        for which in range(returns):
-            projection.project(np.ascontiguousarray(self.range_m[..., which]), points[:, :, which])
-        return points
+        return self.readings.xyz
 
 
 def rows(payloads: Sequence[bytes]) -> U8Array:
@@ -77,17 +79,4 @@ def decode(packets: U8Array, content: bytes, options: Mapping[str, str] | None =
     """All columns of the packets (P, size) of one sensor; content: its angle file."""
     lidar = calibration(content).lidar(options or {}, evidence(packets))
     assert not lidar.faults(packets).any()
-    records = lidar.records
-    count = len(packets) * lidar.columns_per_packet
-    starts = records.start + records.stride * np.arange(lidar.columns_per_packet)
-    columns = packets[:, starts[:, None] + np.arange(records.size)].reshape(count, -1)
-    shape = (count, lidar.channels, lidar.returns)
-    range_m = np.empty(shape, np.float32)
-    intensity = np.empty(shape, np.float32)
-    for which in range(lidar.returns):
-        plane = np.empty(shape[:2], np.float32)
-        lidar.read(np.ascontiguousarray(columns), which, Pixels(plane, intensity[..., which], None))
-        range_m[..., which] = plane
-    return Decoded(
-        lidar, lidar.column_headers(packets, np.zeros(len(packets), np.int64)), range_m, intensity
-    )
+    return Decoded(lidar, readings(lidar, packets))

@@ -11,7 +11,8 @@ from mlbatch.arrays import F32Array, F64Array, I64Array, U8Array
 from mlbatch.lidar.geometry import read_rotor_words
 from mlbatch.lidar.interface import Evidence, Lidar, NeighbourStream
 from mlbatch.sensors.robosense import sensor as robosense
-from mlbatch.types import Pixels, Stream
+from mlbatch.types import Stream
+from tests.builders.decoded import readings
 from tests.builders.others import rows
 
 SOURCE = "192.168.1.200"
@@ -51,29 +52,10 @@ class Decoded:
     xyz_m: F64Array
 
 
-def records_of(lidar: Lidar, packets: U8Array) -> U8Array:
-    """The bytes of all columns, one by one."""
-    at = lidar.records
-    begins = [
-        at.start + column // at.per_row * at.stride + column % at.per_row * at.step
-        for column in range(lidar.columns_per_packet)
-    ]
-    pieces = [packets[:, begin : begin + at.size] for begin in begins]
-    return np.ascontiguousarray(np.stack(pieces, axis=1).reshape(-1, at.size))
-
-
 def decoded(lidar: Lidar, packets: U8Array) -> Decoded:
     """All columns of packets (P, size), projected in the sensor frame."""
-    headers = lidar.column_headers(packets, np.zeros(len(packets), np.int64))
-    records = records_of(lidar, packets)
-    shape = (len(records), lidar.channels, lidar.returns)
-    range_m = np.zeros(shape, np.float32)
-    intensity = np.zeros(shape, np.float32)
-    for which in range(lidar.returns):
-        plane = np.zeros(shape[:2], np.float32)
-        lidar.read(records, which, Pixels(plane, intensity[..., which], None))
-        range_m[..., which] = plane
-    rotor_rad, rad_per_ns, _ = read_rotor_words(headers.encoder.reshape(-1))
+    found = readings(lidar, packets)
+    rotor_rad, rad_per_ns, _ = read_rotor_words(found.encoder)
     angle_rad = rotor_rad[:, None] + rad_per_ns[:, None] * lidar.firing_ns[0]
     cosine = np.cos(angle_rad)[..., None]
     sine = np.sin(angle_rad)[..., None]
@@ -81,6 +63,6 @@ def decoded(lidar: Lidar, packets: U8Array) -> Decoded:
         cosine * one[0] + sine * one[1] + one[2]
         for one in (lidar.beams.direction, lidar.beams.origin)
     )
-    xyz_m = range_m[..., None] * towards[:, :, None] + origin[:, :, None]
-    time_ns = headers.stamp_ns.reshape(-1)[:, None] + lidar.firing_ns[0]
-    return Decoded(range_m, intensity, time_ns, angle_rad, xyz_m)
+    xyz_m = found.range_m[..., None] * towards[:, :, None] + origin[:, :, None]
+    time_ns = found.stamp_ns[:, None] + lidar.firing_ns[0]
+    return Decoded(found.range_m, found.intensity, time_ns, angle_rad, xyz_m)

@@ -12,7 +12,8 @@ from mlbatch.lidar.geometry import read_rotor_words
 from mlbatch.lidar.interface import Evidence
 from mlbatch.sensors.velodyne import sensor as velodyne
 from mlbatch.sensors.velodyne.packets import VelodyneLidar
-from mlbatch.types import Pixels, Stream
+from mlbatch.types import Stream
+from tests.builders.decoded import readings
 from tests.builders.velodyne import Sent, VelodyneSpec, encode
 from tests.builders.velodyne_tables import calibration_yaml
 
@@ -67,28 +68,10 @@ def calibration(model: str) -> velodyne.VelodyneCalibration:
     return named
 
 
-def records_of(lidar: VelodyneLidar, packets: U8Array) -> U8Array:
-    """The columns of packets one after the other, as `lidar.records` says."""
-    place = lidar.records
-    at = [
-        place.start + c // place.per_row * place.stride + c % place.per_row * place.step
-        for c in range(lidar.columns_per_packet)
-    ]
-    parts = [packets[:, begin : begin + place.size] for begin in at]
-    return np.stack(parts, axis=1).reshape(-1, place.size)
-
-
 def pixels(lidar: VelodyneLidar, packets: U8Array) -> tuple[F32Array, F32Array]:
     """Ranges and levels, (columns, lasers, returns)."""
-    records = records_of(lidar, packets)
-    shape = (len(records), lidar.channels, lidar.returns)
-    ranges = np.full(shape, -1, np.float32)
-    levels = np.full(shape, -1, np.float32)
-    for which in range(lidar.returns):
-        plane = np.full(shape[:2], -1, np.float32)
-        lidar.read(records, which, Pixels(plane, levels[..., which], None))
-        ranges[..., which] = plane
-    return ranges, levels
+    found = readings(lidar, packets)
+    return found.range_m, found.intensity
 
 
 def fired(lidar: VelodyneLidar, sent: Sent) -> tuple[I64Array, F64Array]:

@@ -30,9 +30,10 @@ from mlbatch.lidar.interface import (
     SensorModel,
 )
 from mlbatch.sensors import Plugin, built_in, models, parse_calibration, plugins
-from mlbatch.types import Pixels, Stream
+from mlbatch.types import Stream
 from mlbatch.units import NS_PER_S
 from tests.builders import hesai_models, livox, ouster, points, robosense_models, velodyne_tables
+from tests.builders.decoded import readings
 from tests.builders.others import rows
 from tests.golden.test_every_model import CASES, ROBOSENSE_NAMES, Sent
 
@@ -231,17 +232,20 @@ def test_a_packet_says_the_same_in_any_company(name: str) -> None:
     )
     for field in ("stamp_ns", "encoder", "valid"):
         assert np.array_equal(getattr(whole, field)[order], getattr(shuffled, field))
-    records = _records(lidar, packets)
-    mixed = np.random.default_rng(3).permutation(len(records))
-    for which in range(lidar.returns):
-        both, apart = _read(lidar, records, which), _read(lidar, records[mixed], which)
-        assert np.array_equal(both.range_m[mixed], apart.range_m)
-        assert np.array_equal(both.intensity[mixed], apart.intensity)
-        assert np.isfinite(both.range_m).all()
-        assert both.range_m.min() >= 0
-        if lidar.beams.angle_rad is None:
-            tables = read_rotor_words(whole.encoder.reshape(-1))[2]
-            assert not both.range_m[lidar.firing_ns[tables] < 0].any()
+    again = np.random.default_rng(3).permutation(len(packets))
+    both, apart = (
+        readings(lidar, one, host_ns[:1].repeat(len(one))) for one in (packets, packets[again])
+    )
+    shape = (len(packets), lidar.columns_per_packet, lidar.channels, lidar.returns)
+    for name in ("range_m", "intensity", "xyz"):
+        here, there = (getattr(one, name).reshape(*shape, -1) for one in (both, apart))
+        if name != "xyz" or lidar.beams.angle_rad is not None:
+            assert np.array_equal(here[again], there, equal_nan=True)
+    assert np.isfinite(both.range_m).all()
+    assert both.range_m.min() >= 0
+    if lidar.beams.angle_rad is None:
+        tables = read_rotor_words(whole.encoder.reshape(-1))[2]
+        assert not both.range_m[lidar.firing_ns[tables] < 0].any()
 
 
 def _check_table(lidar: Lidar) -> None:
@@ -267,20 +271,3 @@ def _check_table(lidar: Lidar) -> None:
 
 def _is_named(lidar: Lidar, model: SensorModel) -> bool:
     return model.name == lidar.model or model.name == lidar.model.replace("OS-", "OS", 1)
-
-
-def _records(lidar: Lidar, packets: U8Array) -> U8Array:
-    """The bytes of all columns, one by one."""
-    at = lidar.records
-    column = np.arange(lidar.columns_per_packet)
-    begins = at.start + column // at.per_row * at.stride + column % at.per_row * at.step
-    found = packets[:, begins[:, None] + np.arange(at.size)]
-    return np.ascontiguousarray(found.reshape(-1, at.size))
-
-
-def _read(lidar: Lidar, records: U8Array, which: int) -> Pixels:
-    shape = (len(records), lidar.channels)
-    reflectivity = np.zeros(shape, np.uint16) if lidar.has_reflectivity else None
-    pixels = Pixels(np.zeros(shape, np.float32), np.zeros(shape, np.float32), reflectivity)
-    lidar.read(records, which, pixels)
-    return pixels

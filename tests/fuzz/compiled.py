@@ -17,8 +17,9 @@ import numpy as np
 
 from mlbatch.arrays import I64Array, U8Array
 from mlbatch.batching.merge import ColumnMerge, column_merge
-from mlbatch.decode.decoder import Decoder, ScanHeader, Source
+from mlbatch.decode.decoder import ScanHeader
 from mlbatch.decode.packet_ring import PacketRing
+from mlbatch.decode.source import Source
 from mlbatch.lidar.content_keys import content_keys, hash_factors
 from mlbatch.lidar.geometry import rotor_words
 from mlbatch.lidar.interface import Lidar
@@ -36,7 +37,7 @@ from tests.builders.headers import ouster_packets, same_as_numpy
 from tests.builders.ouster import OusterSpec
 from tests.builders.velodyne import VelodyneSpec
 from tests.builders.velodyne_streams import PLAIN, made_of
-from tests.decode.test_native_engine import (
+from tests.decode.test_engine import (
     END_NS,
     NAMES,
     OTHERS,
@@ -90,7 +91,7 @@ def _pixel_seeds() -> Seeds:
 def _pair(
     number: int, layout: str, *, is_cut: bool, keeps_repeated: bool, is_packed: bool
 ) -> tuple[Pair | Packing, PacketRing]:
-    """Decoders of both engines for one lidar, of arrays or of packed records."""
+    """Both decoders for one lidar, of arrays or of packed records."""
     lidar = _lidars()[number]
     pose = POSES[number % len(POSES)]
     ring = PacketRing(lidar.packet_size, lidar.records)
@@ -101,8 +102,7 @@ def _pair(
     boxes_m = np.array(BOXES_M if is_cut else ()).reshape(-1, 6)
     if is_packed:
         return Packing(run, sources, boxes_m, PACKED[number % len(PACKED)]), ring
-    engines = ("numpy", "native")
-    return Pair(*(Decoder(run, sources, boxes_m, EXTRAS, engine=name) for name in engines)), ring
+    return Pair(run, sources, boxes_m, EXTRAS), ring
 
 
 def _decode(data: bytes, folder: Path) -> None:

@@ -14,7 +14,8 @@ from mlbatch.discovery.sampler import Sampler
 from mlbatch.errors import MlbatchError
 from mlbatch.lidar.geometry import read_rotor_words
 from mlbatch.lidar.interface import FAULTS, Calibration, Lidar
-from mlbatch.types import ColumnHeaders, PacketBatch, Pixels, Stream, StreamTable
+from mlbatch.types import ColumnHeaders, PacketBatch, Stream, StreamTable
+from tests.builders.decoded import readings
 from tests.builders.vendors import wrongly_excluded
 from tests.fuzz.framing import Part
 from tests.fuzz.harness import BrokenLaw
@@ -154,19 +155,13 @@ def _check_heads(
 
 
 def _check_pixels(lidar: Lidar, packets: U8Array) -> None:
-    at, columns = lidar.records, np.arange(lidar.columns_per_packet)
-    begin = at.start + columns // at.per_row * at.stride + columns % at.per_row * at.step
-    taken = begin[:, None] + np.arange(at.size)
-    records = np.ascontiguousarray(packets.reshape(len(packets), -1)[:, taken]).reshape(-1, at.size)
-    shape = len(records), lidar.channels
-    for which in range(lidar.returns):
-        levels = np.zeros(shape, np.uint16) if lidar.has_reflectivity else None
-        out = Pixels(np.full(shape, np.nan, np.float32), np.full(shape, np.nan, np.float32), levels)
-        lidar.read(records, which, out)
-        if not (np.isfinite(out.range_m).all() and (out.range_m >= 0).all()):
-            raise BrokenLaw("ranges that are negative or not finite")
-        if not np.isfinite(out.intensity).all():
-            raise BrokenLaw("intensities that are not finite")
+    found = readings(lidar, packets)
+    if not (np.isfinite(found.range_m).all() and (found.range_m >= 0).all()):
+        raise BrokenLaw("ranges that are negative or not finite")
+    if not np.isfinite(found.intensity).all():
+        raise BrokenLaw("intensities that are not finite")
+    if not np.isfinite(found.xyz[found.range_m > 0]).all():
+        raise BrokenLaw("points that are not finite")
 
 
 def try_all(calibration: Calibration, rng: random.Random) -> list[Lidar]:

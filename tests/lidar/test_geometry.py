@@ -3,25 +3,21 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mlbatch.arrays import F32Array, F64Array, I64Array
+from mlbatch.arrays import F64Array
 from mlbatch.frames.transforms import from_rpy_deg
 from mlbatch.lidar.geometry import (
     BeamTable,
-    Projection,
-    Tabled,
-    Turning,
-    blocks,
     read_rotor_words,
     rotor_words,
     spherical,
 )
+from tests.builders.decoded import Rotor, projected
 
 AZIMUTH_DEG = (0.0, 1.5, -4.2, 30.0)
 ELEVATION_DEG = (-25.0, -1.0, 3.0, 15.0)
@@ -51,13 +47,11 @@ def _by_hand(axis: str, beam: int, range_m: float, angle: float, lens_m: float) 
 @pytest.mark.parametrize("lens_m", [0.0, 0.035])
 @pytest.mark.parametrize("rotor_hz", [0.0, 10.0, -20.0])
 def test_beams_fire_while_the_rotor_moves(axis: str, lens_m: float, rotor_hz: float) -> None:
-    turning = Turning(_beams(axis, lens_m).moved(POSE), FIRING_NS, 64)
     revolutions = np.linspace(-0.3, 1.4, 41, dtype=np.float64)
     table = np.arange(41) % 2
-    turning.prepare(np.zeros(41, np.int64), rotor_words(revolutions, np.full(41, rotor_hz), table))
+    words = rotor_words(revolutions, np.full(41, rotor_hz), table)
     range_m = np.linspace(0.5, 120, 41 * 4).reshape(41, 4).astype(np.float32)
-    points = np.empty((41, 4, 4), np.float32)
-    turning.project(range_m, points[:, :, :3])
+    points = projected(Rotor(FIRING_NS, _beams(axis, lens_m)), words, range_m, POSE)
     for column in range(41):
         for beam in range(4):
             fired_s = float(FIRING_NS[table[column], beam]) * 1e-9
@@ -65,7 +59,7 @@ def test_beams_fire_while_the_rotor_moves(axis: str, lens_m: float, rotor_hz: fl
             expected = _by_hand(axis, beam, float(range_m[column, beam]), angle, lens_m)
             # float32 at 120 m, and 136 us at 20 Hz: 8e-7 rad of the series are left out.
             allowed = 5e-5 + (1e-4 if abs(rotor_hz) > 10 else 0)
-            np.testing.assert_allclose(points[column, beam, :3], expected, atol=allowed)
+            np.testing.assert_allclose(points[column, beam], expected, atol=allowed)
 
 
 def test_a_beam_to_the_right_at_a_quarter_revolution() -> None:
@@ -74,65 +68,10 @@ def test_a_beam_to_the_right_at_a_quarter_revolution() -> None:
         table = BeamTable(
             spherical(np.zeros(1), np.zeros(1), axis), np.zeros((3, 1, 3)), np.zeros(1)
         )
-        turning = Turning(table, np.zeros((1, 1), np.int64), 1)
-        turning.prepare(np.zeros(1, np.int64), rotor_words(np.array([0.25]), np.zeros(1)))
-        out = np.empty((1, 1, 3), np.float32)
-        turning.project(np.full((1, 1), 2.0, np.float32), out)
+        words = rotor_words(np.array([0.25]), np.zeros(1))
+        rotor = Rotor(np.zeros((1, 1), np.int64), table)
+        out = projected(rotor, words, np.full((1, 1), 2.0, np.float32))
         np.testing.assert_allclose(out[0, 0], expected, atol=1e-6)
-
-
-def _points(projection: Projection, member: I64Array, encoder: I64Array) -> F32Array:
-    """Points (n, 4, 3) at ranges of their own; 0 is one of them."""
-    range_m = np.linspace(0, 120, len(member) * 4).reshape(-1, 4).astype(np.float32)
-    points = np.empty((len(member), 4, 4), np.float32)
-    projection.prepare(member, encoder)
-    projection.project(range_m, points[:, :, :3])
-    return points[:, :, :3]
-
-
-@pytest.mark.parametrize("lens_m", [0.0, 0.035])
-@pytest.mark.parametrize("members", [(0, 0, 0, 1, 1), (0, 0, 0, 0, 0), (1, 1, 1, 1, 1)])
-def test_rotors_together_equal_each_alone(lens_m: float, members: tuple[int, ...]) -> None:
-    # The second one has the pose of its frame: its zeros have signs.
-    own = _beams("y", lens_m)
-    level = replace(own, direction=-own.direction, reach_m=np.zeros(4))
-    tables = _beams("x", lens_m).moved(POSE), level
-    member = np.array(members)
-    revolutions = np.linspace(0, 1, 5, dtype=np.float64)
-    words = rotor_words(revolutions, np.full(5, 10.0), np.arange(5) % 2)
-    together = _points(Turning(tables[0], FIRING_NS, 5, tables[1:]), member, words)
-    for number, table in enumerate(tables):
-        alone = _points(Turning(table, FIRING_NS, 5), np.zeros(5, np.int64), words)
-        columns = member == number
-        assert together[columns].tobytes() == alone[columns].tobytes()
-
-
-@pytest.mark.parametrize(
-    "positions",
-    [range(60), [*range(40, 64), *range(36)], [*range(0, 60, 2), *range(1, 61, 2)], [7] * 60],
-    ids=["in a row", "past the end of a revolution", "each second", "one"],
-)
-def test_positions_in_a_row_equal_each_alone(positions: list[int]) -> None:
-    angle_rad = np.linspace(0, 2 * np.pi, 64, endpoint=False).astype(np.float64)
-    first = replace(_beams("x", 0.02), angle_rad=angle_rad)
-    tables = first.moved(POSE), replace(first, reach_m=first.reach_m + 0.5)
-    encoder = np.array(positions)
-    # Where the first sensor's last position comes before the other's first one, too.
-    for member in (np.zeros(60, np.int64), np.repeat([0, 1], [24, 36])):
-        together = _points(Tabled(tables, 60), member, encoder)
-        for column in range(60):
-            one = slice(column, column + 1)
-            projection = Tabled(tables, 1)
-            range_m = np.linspace(0, 120, 240).reshape(-1, 4).astype(np.float32)[one]
-            alone = np.empty((1, 4, 3), np.float32)
-            projection.prepare(member[one], encoder[one])
-            projection.project(range_m, alone)
-            assert together[one].tobytes() == alone.tobytes()
-
-
-def test_blocks_are_the_columns_of_each_sensor() -> None:
-    assert blocks(np.array([0, 0, 2]), 4) == [slice(0, 2), slice(2, 2), slice(2, 3), slice(3, 3)]
-    assert blocks(np.zeros(3, np.int64), 1) == [slice(0, 3)]
 
 
 @given(

@@ -9,10 +9,10 @@ import pytest
 
 from mlbatch.lidar.geometry import read_rotor_words, rotor_words
 from mlbatch.sensors.hesai.angles import read_angles, read_at128
-from mlbatch.sensors.hesai.at128 import at128_projection
 from mlbatch.sensors.velodyne.calibration import VelodyneFile
+from tests.builders.decoded import projected
 from tests.recordings import RECORDINGS
-from tests.sensors.hesai.test_at128 import CHANNELS, DEG, NO_FIRING, by_the_sheet, points
+from tests.sensors.hesai.test_at128 import CHANNELS, DEG, NO_FIRING, beams, by_the_sheet
 from tests.sensors.velodyne.test_calibration import read
 from tests.sensors.velodyne.test_hdl64 import check_many_points
 
@@ -99,9 +99,8 @@ def test_real_file_against_plain_loops() -> None:
     encoder = rotor_words(
         rng.random(columns), rng.choice([-200, 0, 200], columns) / 60, rng.integers(0, 2, columns)
     )
-    projection = at128_projection(file, firing_ns, np.eye(4), 64)
     range_m = rng.uniform(1, 180, (columns, CHANNELS)).astype(np.float32)
-    found = points(projection, encoder, range_m)
+    found = projected(beams(file, firing_ns), encoder, range_m)
     angle, speed, table = read_rotor_words(encoder)
     worst_m = 0.0
     for column in range(columns):
@@ -118,9 +117,8 @@ def test_field_of_view_of_the_real_file() -> None:
     """Beams with adjustments cover 30 to 150 deg and a margin."""
     file = read_at128(AT128, AT128.read_bytes())
     assert file is not None
-    projection = at128_projection(file, NO_FIRING, np.eye(4), 180)
     encoder = rotor_words(np.arange(180) / 180, np.zeros(180))
-    found = points(projection, encoder, np.ones((180, CHANNELS), np.float32))
+    found = projected(beams(file, NO_FIRING), encoder, np.ones((180, CHANNELS), np.float32))
     given = file.azimuth_adjust_rad.T != 0
     azimuth = np.arctan2(found[:, :, 0], found[:, :, 1])[given] / DEG
     assert 10 < azimuth.min() < 30

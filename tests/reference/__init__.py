@@ -1,1 +1,1 @@
-"""What the documents say, as numbers that share nothing with the package."""
+"""Documents as numbers, and literal implementations that share nothing with the package."""

@@ -16,7 +16,7 @@ def test_a_lidar_without_imu() -> None:
     assert not lidar.is_imu(48)
     assert len(lidar.imu(np.zeros((2, 48), np.uint8), 3).stamp_ns) == 0
     assert lidar.sensor_from_imu() is None
-    assert lidar.projection(np.eye(4), 1) is None
+    assert lidar.projection(np.eye(4)) is None
 
 
 @pytest.mark.parametrize("size", [1, 5, 8, 9, 16, 1206])

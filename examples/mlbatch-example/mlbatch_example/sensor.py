@@ -18,8 +18,9 @@ from mlbatch.arrays import BoolArray, I64Array, U8Array
 from mlbatch.errors import RigError
 from mlbatch.lidar.geometry import BeamTable, spherical
 from mlbatch.lidar.interface import FAULTS, Calibration, Evidence, Records, SensorModel
+from mlbatch.lidar.pixel_table import PixelTable, readings
 from mlbatch.sensors.base import BaseLidar
-from mlbatch.types import ColumnHeaders, Pixels
+from mlbatch.types import ColumnHeaders
 
 # A structured array; numpy has no type for the fields of a dtype.
 Fields: TypeAlias = npt.NDArray[Any]
@@ -44,13 +45,15 @@ COLUMNS = 8
 COLUMN_NS = 250_000
 POSITIONS = 36_000
 ELEVATION_DEG = (-15.0, -5.0, 5.0, 15.0)
-METRES = 0.005
+PER_METRE = 200.0
 
 READING = np.dtype([("range", "<u2"), ("intensity", "u1")])
 COLUMN = np.dtype([("angle", "<u2"), ("reading", READING, 4)])
 PACKET = np.dtype(
     [("magic", "S4"), ("counter", "<u4"), ("time_ns", "<u8"), ("column", COLUMN, COLUMNS)]
 )
+# Readings begin behind the angle, 3 bytes each: u16 range, u8 intensity.
+PIXELS = PixelTable(READING.itemsize, readings(((2,),), 4, "<u2"), PER_METRE)
 
 
 class ExampleCalibration:
@@ -107,7 +110,7 @@ class ExampleLidar(BaseLidar):
         self.columns_per_packet = COLUMNS
         self.column_period_ns = COLUMN_NS
         self.records = Records(HEADER_BYTES, COLUMN.itemsize, COLUMN.itemsize)
-        self.pixel_layout = (VENDOR,)
+        self.pixels = PIXELS
         self.return_types = (0,)
         self.sends_twice = False
         self.sequence_modulus = 1 << 32
@@ -141,12 +144,6 @@ class ExampleLidar(BaseLidar):
         stamp_ns = first_ns + np.arange(COLUMNS) * COLUMN_NS
         encoder = fields["column"]["angle"].astype(np.int64)
         return ColumnHeaders(stamp_ns, encoder, np.ones(stamp_ns.shape, np.bool_))
-
-    def read(self, records: U8Array, which: int, out: Pixels) -> None:
-        """Ranges and intensities of n columns."""
-        reading = np.ascontiguousarray(records).view(COLUMN)[:, 0]["reading"]
-        np.multiply(reading["range"], np.float32(METRES), out=out.range_m)
-        out.intensity[:] = reading["intensity"]
 
 
 def _fields(packets: U8Array) -> Fields:

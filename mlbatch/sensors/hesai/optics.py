@@ -11,11 +11,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from mlbatch.arrays import F32Array, F64Array, I64Array
-from mlbatch.lidar.geometry import BeamTable, Turning
-
-# Closer returns are projected from the axis.
-_NEAREST_M = np.float32(0.09)
+from mlbatch.arrays import F64Array
+from mlbatch.lidar.geometry import BeamTable
+from mlbatch.lidar.projections import OffAxis
 
 
 def off_axis(on_axis: BeamTable, centre_m: F64Array, *, from_centre: bool) -> BeamTable:
@@ -27,42 +25,15 @@ def off_axis(on_axis: BeamTable, centre_m: F64Array, *, from_centre: bool) -> Be
     return replace(on_axis, origin=origin, reach_m=reach_m)
 
 
-class OffAxis:
-    """`Projection` of off-axis beams whose ranges count from the axis."""
-
-    def __init__(
-        self,
-        on_axis: BeamTable,
-        centre_m: F64Array,
-        body_from_sensor: F64Array,
-        firing_ns: I64Array,
-        columns: int,
-    ) -> None:
-        """on_axis: in the sensor frame; centre_m: (3,); columns: largest batch."""
-        firing_ns = np.maximum(firing_ns, 0)
-        beams = off_axis(on_axis, centre_m, from_centre=False)
-        self._beams = Turning(beams.moved(body_from_sensor), firing_ns, columns)
-        self._on_axis = Turning(on_axis.moved(body_from_sensor), firing_ns, columns)
-        miss_m2 = (centre_m**2).sum() - _along(on_axis, centre_m) ** 2
-        self._miss_m2 = miss_m2.astype(np.float32)
-        self._aimed: tuple[I64Array, I64Array] = np.empty(0, np.int64), np.empty(0, np.int64)
-
-    def prepare(self, member: I64Array, encoder: I64Array) -> None:
-        """Prepare directions of columns."""
-        self._aimed = member, encoder
-        self._beams.prepare(member, encoder)
-
-    def project(self, range_m: F32Array, out: F32Array) -> None:
-        """Points (n, B, 3), m."""
-        behind_m = np.maximum(range_m * range_m - self._miss_m2, np.float32(0))
-        self._beams.project(np.sqrt(behind_m, out=behind_m), out)
-        near = range_m <= _NEAREST_M
-        near &= range_m > 0
-        if near.any():
-            self._on_axis.prepare(*self._aimed)
-            plain = np.empty((*range_m.shape, 3), np.float32)
-            self._on_axis.project(range_m, plain)
-            out[near] = plain[near]
+def axis_ranges(on_axis: BeamTable, centre_m: F64Array, body_from_sensor: F64Array) -> OffAxis:
+    """Off-axis beams whose ranges count from the axis; on_axis: in the sensor frame."""
+    beams = off_axis(on_axis, centre_m, from_centre=False)
+    miss_m2 = (centre_m**2).sum() - _along(on_axis, centre_m) ** 2
+    return OffAxis(
+        beams.moved(body_from_sensor),
+        miss_m2.astype(np.float32),
+        on_axis.moved(body_from_sensor).origin[2, 0].astype(np.float32),
+    )
 
 
 def _along(beams: BeamTable, centre_m: F64Array) -> F64Array:

@@ -19,7 +19,7 @@ from mlbatch.sensors.hesai.firing import NEVER
 from mlbatch.sensors.hesai.layout import CRC_SIZE, RETURN_MODES, SAFETY, SAFETY_SIZE, Layout
 from mlbatch.sensors.hesai.models import OPERATIONS
 from mlbatch.sensors.packet_bytes import number
-from mlbatch.types import ColumnHeaders, Pixels
+from mlbatch.types import ColumnHeaders
 from mlbatch.units import MM_PER_M, NS_PER_S, NS_PER_US
 
 _CENTURY = 70  # Years below are in this century, others in the last.
@@ -144,22 +144,6 @@ class PacketReader:
             return None
         width = self.layout.model.tail.sequence_bytes
         return number(packets, self.layout.prefix + at, width)
-
-    def read(self, records: U8Array, which: int, out: Pixels) -> None:
-        """Decode return `which` of n columns."""
-        model = self.layout.model
-        pixel = records.view(self._record)[:, 0]["block"][:, which]["reading"]
-        distance = pixel["distance"]
-        unit_mm = self.layout.unit_mm
-        if MM_PER_M % unit_mm:
-            # Integers below 2**24 are exact in float32, so only the division rounds.
-            np.multiply(distance, np.float32(unit_mm), out=out.range_m)
-            np.divide(out.range_m, np.float32(MM_PER_M), out=out.range_m)
-        else:
-            np.divide(distance, np.float32(MM_PER_M // unit_mm), out=out.range_m)
-        if model.silent:
-            out.range_m[distance <= model.silent] = 0
-        out.intensity[...] = pixel["reflectivity"]
 
     def pixels(self) -> PixelTable:
         """Pixel layout for compiled decoding."""

@@ -16,8 +16,9 @@ import numpy as np
 from mlbatch.arrays import F64Array, I64Array, U8Array, median
 from mlbatch.errors import RigError
 from mlbatch.lidar.content_keys import content_keys
-from mlbatch.lidar.geometry import BeamTable, Projection, spherical
+from mlbatch.lidar.geometry import BeamTable, spherical
 from mlbatch.lidar.interface import Calibration, Evidence, SensorModel
+from mlbatch.lidar.projections import Projection
 from mlbatch.sensors.base import BaseLidar
 from mlbatch.sensors.hesai import models as rows
 from mlbatch.sensors.hesai.angles import At128File, HesaiAngles, read_angles, read_at128
@@ -25,11 +26,11 @@ from mlbatch.sensors.hesai.at128 import at128_projection
 from mlbatch.sensors.hesai.identify import describe, identify
 from mlbatch.sensors.hesai.layout import Layout
 from mlbatch.sensors.hesai.models import Model
-from mlbatch.sensors.hesai.optics import OffAxis, off_axis
+from mlbatch.sensors.hesai.optics import axis_ranges, off_axis
 from mlbatch.sensors.hesai.packets import PacketReader
 from mlbatch.sensors.nominal import apart_deg, refuse_other_beams
 from mlbatch.sensors.options import check_options
-from mlbatch.types import ColumnHeaders, Pixels
+from mlbatch.types import ColumnHeaders
 from mlbatch.units import M_PER_MM, RAD_PER_DEG
 
 __all__ = ["BUILT_IN", "MODELS", "VENDOR", "HesaiCalibration", "HesaiLidar", "describe"]
@@ -173,7 +174,6 @@ class HesaiLidar(BaseLidar):
         self.columns_per_packet = layout.columns
         self.column_period_ns = model.timing.step_ns / model.timing.divisor
         self.records = self._reader.records
-        self.pixel_layout = (VENDOR, model.name, layout.mode.returns, layout.unit, layout.unit_mm)
         self.pixels = self._reader.pixels()
         self.return_types = layout.mode.types
         self.channel = np.arange(model.channels)
@@ -201,15 +201,11 @@ class HesaiLidar(BaseLidar):
         """Timestamps and rotor words; packets carry the date, so host_ns is not used."""
         return self._reader.column_headers(packets)
 
-    def read(self, records: U8Array, which: int, out: Pixels) -> None:
-        """Decode return `which` of columns (n, records.size) into `out`."""
-        self._reader.read(records, which, out)
-
-    def projection(self, body_from_sensor: F64Array, columns: int) -> Projection | None:
+    def projection(self, body_from_sensor: F64Array) -> Projection | None:
         """Projection of off-axis beams whose ranges count from the axis; else None."""
         if self._centre_m is None or self._from_centre:
             return None
-        return OffAxis(self._on_axis, self._centre_m, body_from_sensor, self.firing_ns, columns)
+        return axis_ranges(self._on_axis, self._centre_m, body_from_sensor)
 
 
 class At128Lidar(HesaiLidar):
@@ -225,9 +221,9 @@ class At128Lidar(HesaiLidar):
         super().__init__(layout, options, evidence, file)
         self._file = file
 
-    def projection(self, body_from_sensor: F64Array, columns: int) -> Projection | None:
+    def projection(self, body_from_sensor: F64Array) -> Projection | None:
         """Projection by the mirrors."""
-        return at128_projection(self._file, self.firing_ns, body_from_sensor, columns)
+        return at128_projection(self._file, body_from_sensor)
 
 
 def _is_on(options: Mapping[str, str], key: str, default: str = "off") -> bool:

@@ -7,7 +7,7 @@ communication protocol of the Avia2, v1.0.
 from __future__ import annotations
 
 import zlib
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import TypeAlias
@@ -17,6 +17,7 @@ import numpy.typing as npt
 
 from mlbatch.arrays import F32Array, F64Array, I64Array, U8Array
 from mlbatch.lidar.interface import FAULTS
+from mlbatch.lidar.projections import Coordinates
 from mlbatch.types import ImuSamples
 from mlbatch.units import RAD_PER_DEG, STANDARD_GRAVITY
 
@@ -51,7 +52,6 @@ _SPHERICAL = np.dtype([("depth", "<u4"), ("zenith", "<u2"), ("azimuth", "<u2"), 
 _SAMPLE = np.dtype([("angular_velocity", "<f4", 3), ("acceleration_g", "<f4", 3)])
 IMU_SIZE = HEADER_SIZE + _SAMPLE.itemsize
 _CIRCLE_CDEG = 36000
-_QUARTER_CDEG = 9000
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,15 +109,13 @@ def stamps_ns(packets: U8Array, points: int) -> I64Array:
     return stamp_ns
 
 
-def read_points(
-    records: U8Array, which: int, kind: PointKind
-) -> tuple[F64Array, F64Array, U8Array]:
-    """Coordinates (n, 3) and ranges (n,) in metres, and intensities (n,), of one return."""
-    layout, convert = _RETURNS[kind.data_type]
-    begin = which * layout.itemsize
-    point = records[:, begin : begin + layout.itemsize].view(layout)[:, 0]
-    xyz_m, range_m = convert(point)
-    return xyz_m, range_m, point["intensity"]
+def coordinates(kind: PointKind, body_from_sensor: F64Array) -> Coordinates:
+    """Forms of the points of a data type, moved into the body frame."""
+    form, layout = _RETURNS[kind.data_type]
+    intensity_at = layout.itemsize - np.dtype(_INTENSITY).itemsize
+    return Coordinates(
+        form, layout.itemsize, intensity_at, np.ascontiguousarray(body_from_sensor[:3]), _sines()
+    )
 
 
 def read_imu(payloads: U8Array, sensor: int) -> ImuSamples:
@@ -136,36 +134,6 @@ def read_imu(payloads: U8Array, sensor: int) -> ImuSamples:
         )
 
 
-def _from_millimetres(point: Points) -> tuple[F64Array, F64Array]:
-    return _cartesian(point["xyz"] / 1000.0)
-
-
-def _from_centimetres(point: Points) -> tuple[F64Array, F64Array]:
-    return _cartesian(point["xyz"] / 100.0)
-
-
-def _cartesian(xyz_m: F64Array) -> tuple[F64Array, F64Array]:
-    x, y, z = xyz_m.T
-    return xyz_m, np.sqrt(x * x + y * y + z * z)
-
-
-def _spherical(point: Points) -> tuple[F64Array, F64Array]:
-    zenith = point["zenith"].astype(np.int64)
-    azimuth = point["azimuth"].astype(np.int64)
-    range_m = point["depth"] / 1000.0
-    flat_m = range_m * _sine(zenith)
-    up_m = range_m * _sine(zenith + _QUARTER_CDEG)
-    forward_m = flat_m * _sine(azimuth + _QUARTER_CDEG)
-    left_m = flat_m * _sine(azimuth)
-    return np.stack([forward_m, left_m, up_m], axis=1), range_m
-
-
-def _sine(angle_cdeg: I64Array) -> F32Array:
-    """Sine of whole hundredths of a degree."""
-    sines: F32Array = _sines().take(angle_cdeg % _CIRCLE_CDEG)
-    return sines
-
-
 @lru_cache(maxsize=1)
 def _sines() -> F32Array:
     """Sines of a full circle; float32, so that the last digit of a library has no effect."""
@@ -173,10 +141,11 @@ def _sines() -> F32Array:
     return sines
 
 
-# By data type: layout of a return, and conversion to coordinates and range.
-_RETURNS: Mapping[int, tuple[np.dtype[np.void], Callable[[Points], tuple[F64Array, F64Array]]]] = {
-    1: (_CARTESIAN32, _from_millimetres),
-    2: (_CARTESIAN16, _from_centimetres),
-    3: (_SPHERICAL, _spherical),
-    0x11: (_CARTESIAN32, _from_millimetres),
+# By data type: form of the integers, as in `native.h`, and layout of a return.
+_MILLIMETRES, _CENTIMETRES, _ANGLES = range(3)
+_RETURNS: Mapping[int, tuple[int, np.dtype[np.void]]] = {
+    1: (_MILLIMETRES, _CARTESIAN32),
+    2: (_CENTIMETRES, _CARTESIAN16),
+    3: (_ANGLES, _SPHERICAL),
+    0x11: (_MILLIMETRES, _CARTESIAN32),
 }

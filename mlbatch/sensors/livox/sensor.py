@@ -13,26 +13,27 @@ from pathlib import Path
 
 import numpy as np
 
-from mlbatch.arrays import F32Array, F64Array, I64Array, U8Array, median
+from mlbatch.arrays import F64Array, I64Array, U8Array, median
 from mlbatch.errors import RigError
 from mlbatch.lidar.content_keys import content_keys
-from mlbatch.lidar.geometry import BeamTable, Projection
+from mlbatch.lidar.geometry import BeamTable
 from mlbatch.lidar.interface import Calibration, Evidence, Records, SensorModel
+from mlbatch.lidar.projections import Coordinates
 from mlbatch.sensors.base import BaseLidar
 from mlbatch.sensors.livox.identify import describe, identify
 from mlbatch.sensors.livox.packets import (
     HEADER_SIZE,
     IMU_SIZE,
     PointKind,
+    coordinates,
     faults,
     headers,
     read_imu,
-    read_points,
     stamps_ns,
 )
 from mlbatch.sensors.options import check_options
 from mlbatch.sensors.packet_bytes import most_common
-from mlbatch.types import ColumnHeaders, ImuSamples, Pixels
+from mlbatch.types import ColumnHeaders, ImuSamples
 from mlbatch.units import NS_PER_S
 
 __all__ = ["BUILT_IN", "MODELS", "VENDOR", "LivoxCalibration", "LivoxLidar", "describe"]
@@ -100,10 +101,7 @@ def read_calibration(path: Path, content: bytes) -> Calibration | None:
 
 
 class LivoxLidar(BaseLidar):
-    """Decoder of one sensor; implements `Lidar`.
-
-    Beyond the protocol: `last_xyz_m`, the coordinates (n, 3) of the last points read.
-    """
+    """Decoder of one sensor; implements `Lidar`."""
 
     def __init__(self, kind: PointKind, evidence: Evidence, *, check_crc: bool) -> None:
         packets = evidence.sample[faults(evidence.sample, kind, check_crc=False) == 0]
@@ -115,7 +113,6 @@ class LivoxLidar(BaseLidar):
         self.packet_size = evidence.size
         self.columns_per_packet = (evidence.size - HEADER_SIZE) // kind.size
         self.records = Records(HEADER_SIZE, kind.size, kind.size)
-        self.pixel_layout = (VENDOR, kind.data_type)
         self.return_types = (0,) * kind.returns
         self.sends_twice = False
         self.channel = np.zeros(1, np.int64)
@@ -129,7 +126,6 @@ class LivoxLidar(BaseLidar):
         # No rotor, hence no dark sectors.
         self.lit_share = 1.0
         self._packets_per_s = 0.0 if self.notes else _packets_per_s(packets)
-        self.last_xyz_m: F64Array = np.empty((0, 3))
         self._kind = kind
         self._check_crc = check_crc
 
@@ -153,12 +149,6 @@ class LivoxLidar(BaseLidar):
         stamp_ns = stamps_ns(packets, self.columns_per_packet)
         return ColumnHeaders(stamp_ns, np.zeros_like(stamp_ns), np.ones(stamp_ns.shape, np.bool_))
 
-    def read(self, records: U8Array, which: int, out: Pixels) -> None:
-        """Decode return `which` of n points; keeps their coordinates for the projection."""
-        self.last_xyz_m, out.range_m[:, 0], out.intensity[:, 0] = read_points(
-            records, which, self._kind
-        )
-
     def is_imu(self, size: int) -> bool:
         """Whether a payload of this size is an IMU packet."""
         return size == IMU_SIZE
@@ -171,26 +161,9 @@ class LivoxLidar(BaseLidar):
         """Identity: livox_ros_driver2 publishes points and IMU data in one frame."""
         return np.eye(4)
 
-    def projection(self, body_from_sensor: F64Array, columns: int) -> Projection:
-        """Transform of the last points read into the body frame."""
-        return MovedPoints(self, body_from_sensor)
-
-
-class MovedPoints:
-    """The last points read, moved into the body frame; implements `Projection`."""
-
-    def __init__(self, lidar: LivoxLidar, body_from_sensor: F64Array) -> None:
-        self._lidar = lidar
-        self._body_from_sensor = body_from_sensor
-
-    def prepare(self, member: I64Array, encoder: I64Array) -> None:
-        """No rotor: nothing to prepare."""
-
-    def project(self, range_m: F32Array, out: F32Array) -> None:
-        """Rotate and translate, summed in a fixed order (see `lidar/geometry.py`)."""
-        x, y, z = self._lidar.last_xyz_m.T
-        for axis, (by_x, by_y, by_z, shift) in enumerate(self._body_from_sensor[:3]):
-            out[:, 0, axis] = x * by_x + y * by_y + z * by_z + shift
+    def projection(self, body_from_sensor: F64Array) -> Coordinates:
+        """Transform of the recorded coordinates."""
+        return coordinates(self._kind, body_from_sensor)
 
 
 def _is_continuous(packets: U8Array) -> bool:

@@ -14,9 +14,10 @@ import numpy as np
 
 from mlbatch.arrays import BoolArray, F64Array, I64Array, U8Array, rows_of
 from mlbatch.errors import RigError
-from mlbatch.lidar.geometry import BeamTable, Projection
+from mlbatch.lidar.geometry import BeamTable
 from mlbatch.lidar.header_table import StampedColumns
 from mlbatch.lidar.interface import Calibration, Evidence, Records, SensorModel
+from mlbatch.lidar.projections import Projection
 from mlbatch.sensors.options import check_options
 from mlbatch.sensors.ouster.identify import describe
 from mlbatch.sensors.ouster.imu import (
@@ -35,9 +36,9 @@ from mlbatch.sensors.ouster.packets import (
     PacketHeaders,
     first_measurement_ids,
 )
-from mlbatch.sensors.ouster.pixels import PixelReader, pixel_table
+from mlbatch.sensors.ouster.pixels import pixel_table
 from mlbatch.sensors.ouster.profiles import FUSA, LEGACY
-from mlbatch.types import ColumnHeaders, ImuSamples, Pixels
+from mlbatch.types import ColumnHeaders, ImuSamples
 from mlbatch.units import NS_PER_S
 
 __all__ = [
@@ -200,7 +201,6 @@ class OusterLidar:
         self.column_period_ns = _column_period_ns(described)
         self.lit_share: float | None = _lit_share(described)
         self.records = Records(layout.record_start, layout.record_size, layout.record_size)
-        self.pixel_layout = (VENDOR, layout.profile.name, layout.beams, described.strongest_first)
         # The type of dual returns follows from their order, see `typed_by`.
         self.return_types: tuple[int, ...] = (1,) if self.returns == 1 else (0, 0)
         self.typed_by = "order" if self.returns == 2 and described.strongest_first else ""
@@ -222,7 +222,6 @@ class OusterLidar:
         self._metadata = described
         self._headers = _headers(described, check_crc)
         self.header_bytes = self._headers.read_bytes()
-        self._pixels = PixelReader(layout)
         self.pixels = pixel_table(layout)
         self._rank, in_window = _packet_ranks(described)
         self._frame_ids = _FRAME_IDS.get(described.header, _DEFAULT_FRAME_IDS)
@@ -265,10 +264,6 @@ class OusterLidar:
         """Timestamps, measurement ids and validity of all columns."""
         return self._headers.column_headers(packets)
 
-    def read(self, records: U8Array, which: int, out: Pixels) -> None:
-        """Decode return `which` of columns (n, record_size) into `out`, which may be strided."""
-        self._pixels.read(records, which, out)
-
     def is_imu(self, size: int) -> bool:
         """Whether a payload of this size is an IMU packet; old ROS drivers append one byte."""
         return size != self.packet_size and _is_imu(self._metadata, size)
@@ -283,7 +278,7 @@ class OusterLidar:
         pose: F64Array = self._metadata.imu_to_sensor.copy()
         return pose
 
-    def projection(self, body_from_sensor: F64Array, columns: int) -> Projection | None:
+    def projection(self, body_from_sensor: F64Array) -> Projection | None:
         """None: the beam vectors suffice."""
         return None
 

@@ -14,17 +14,17 @@ from pathlib import Path
 
 import numpy as np
 
-from mlbatch.arrays import F32Array, F64Array, I64Array, U8Array
+from mlbatch.arrays import F64Array, I64Array, U8Array
 from mlbatch.errors import RigError
 from mlbatch.lidar.content_keys import hash_factors
-from mlbatch.lidar.geometry import BeamTable, Projection, rotor_words
+from mlbatch.lidar.geometry import BeamTable, rotor_words
 from mlbatch.lidar.header_table import SingleColumns
 from mlbatch.lidar.interface import FAULTS, Calibration, Evidence, Lidar, Records, SensorModel
-from mlbatch.lidar.placed import LastRead, PlacedPoints
+from mlbatch.lidar.projections import PlacedPoints
 from mlbatch.ros.point_packets import HEAD, KINDS, MAGIC, MOST_SLOTS, REALS, VERSION, Layout
 from mlbatch.sensors.base import BaseLidar
 from mlbatch.sensors.options import check_options
-from mlbatch.types import ColumnHeaders, Pixels
+from mlbatch.types import ColumnHeaders
 
 VENDOR = "any"
 # In the order of KINDS.
@@ -113,7 +113,6 @@ def describe(size: int, sample: U8Array) -> str | None:
 class CloudLidar(BaseLidar):
     """A topic of clouds; implements `Lidar`."""
 
-    has_places = True
     sends_twice = False
     typed_by = ""
 
@@ -129,8 +128,6 @@ class CloudLidar(BaseLidar):
         self.packet_size = layout.size
         self.columns_per_packet = 1
         self.records = Records(0, layout.size, layout.size)
-        # `read` passes coordinates to the projection of the same topic, so layouts differ by topic.
-        self.pixel_layout = ("points", slots, topic)
         # In columns of one point the rotor word carries the ring.
         rings = _RINGS if slots == 1 else 1
         self.channel = (
@@ -142,7 +139,6 @@ class CloudLidar(BaseLidar):
         self.calibration = "none"
         self._shared = layout.begin.view(np.uint8)[:_SHARED_BYTES].view("<u8")[0]
         self._reals = slice(HEAD.itemsize, HEAD.itemsize + 4 * REALS * slots)
-        self._scratch = LastRead()
         # In columns of one point, rotor words differ.
         if slots > 1:
             self.headers = SingleColumns(
@@ -174,18 +170,10 @@ class CloudLidar(BaseLidar):
             stamp_ns, rotor_words(still, still, ring), np.ones(stamp_ns.shape, np.bool_)
         )
 
-    def read(self, records: U8Array, which: int, out: Pixels) -> None:
-        """Ranges and intensities of columns (n, records.size); keeps coordinates for `points`."""
-        reals: F32Array = records[:, self._reals].view("<f4")
-        reals = reals.reshape(len(records), REALS, self.channels)
-        self._scratch.reals = reals
-        x, y, z, intensity = reals.transpose(1, 0, 2)
-        range_m = np.multiply(x, x, out=out.range_m)
-        range_m += y * y
-        range_m += z * z
-        np.sqrt(range_m, out=range_m)
-        np.copyto(out.intensity, intensity)
-
-    def projection(self, body_from_sensor: F64Array, columns: int) -> Projection | None:
+    def projection(self, body_from_sensor: F64Array) -> PlacedPoints:
         """Transform of the recorded coordinates."""
-        return PlacedPoints(self._scratch, body_from_sensor, HEAD.itemsize)
+        return PlacedPoints(
+            HEAD.itemsize,
+            body_from_sensor[:3, :3].astype(np.float32),
+            body_from_sensor[:3, 3].astype(np.float32),
+        )

@@ -10,13 +10,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from mlbatch.arrays import BoolArray, F64Array, I64Array, U8Array, U16Array, median
+from mlbatch.arrays import BoolArray, F64Array, I64Array, U8Array, median
 from mlbatch.lidar.geometry import rotor_words
 from mlbatch.lidar.interface import FAULTS, Records
 from mlbatch.lidar.pixel_table import PixelTable, readings
 from mlbatch.sensors.packet_bytes import has_bytes, majority, number
 from mlbatch.sensors.robosense.models import READING, Layout, Model
-from mlbatch.types import ColumnHeaders, Pixels
+from mlbatch.types import ColumnHeaders
 from mlbatch.units import NS_PER_S, NS_PER_US
 
 _CDEG_PER_REVOLUTION = 36000
@@ -163,20 +163,6 @@ class PacketReader:
         words = rotor_words(revolutions, revolutions_per_s[:, None])
         valid = np.repeat(good, shape.columns, axis=1)
         return ColumnHeaders(stamp_ns[:, None] + after_ns, words, valid)
-
-    def read(self, records: U8Array, which: int, out: Pixels) -> None:
-        """Decode return `which` of columns (n, record size) into `out`."""
-        count, size = records.shape
-        per_block = min(self._model.channels, self._model.layout.per_block)
-        for part in range(self._model.blocks_per_round if count else 0):
-            begin = which * self._shape.return_step + part * self._model.layout.stride
-            channels = slice(part * per_block, (part + 1) * per_block)
-            raw: U16Array = np.ndarray((count, per_block), ">u2", records, begin, (size, READING))
-            if self._model.range_mask != 0xFFFF:
-                raw = raw & np.uint16(self._model.range_mask)
-            np.divide(raw, self._units_per_m, out=out.range_m[:, channels])
-            intensity = records[:, begin + 2 : begin + READING * per_block : READING]
-            out.intensity[:, channels] = intensity
 
     def pixels(self) -> PixelTable:
         """Pixel layout for compiled decoding."""

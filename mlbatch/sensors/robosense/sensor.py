@@ -46,7 +46,7 @@ from mlbatch.sensors.robosense.identify import (
 )
 from mlbatch.sensors.robosense.models import FIRST_LAYOUT, ROWS, VENDOR, Model
 from mlbatch.sensors.robosense.packets import PacketReader, in_time_form, shape_of, times_ns
-from mlbatch.types import ColumnHeaders, Pixels
+from mlbatch.types import ColumnHeaders
 from mlbatch.units import RAD_PER_DEG
 
 __all__ = ["BUILT_IN", "MODELS", "VENDOR", "RobosenseLidar", "describe", "read_calibration"]
@@ -252,15 +252,6 @@ class RobosenseLidar(BaseLidar):
         self.beams = beam_table(row, angles, mirrored=mirrored)
         self.sequence_modulus = COUNTER_MODULUS if is_counted(points, row) else 0
         self.timestamp_mode = difop.sync if difop is not None and row.has_sync else ""
-        self.pixel_layout = (
-            VENDOR,
-            row.channels,
-            row.layout.stride,
-            shape.return_step,
-            steps_per_m,
-            row.range_mask,
-            shape.returns,
-        )
         self.calibration = ""
         doubtful = notes_on_model(identify_unit(evidence), row, difop, is_named=is_named)
         self.notes = (*time_notes, *mode_notes, *unit_notes, *doubtful)
@@ -294,10 +285,6 @@ class RobosenseLidar(BaseLidar):
     def column_headers(self, packets: U8Array, host_ns: I64Array) -> ColumnHeaders:
         """Timestamps, rotor words and validity of all columns."""
         return self._packets.column_headers(packets)
-
-    def read(self, records: U8Array, which: int, out: Pixels) -> None:
-        """Decode return `which` of columns (n, record size) into `out`."""
-        self._packets.read(records, which, out)
 
 
 def _timed(points: U8Array, row: Model) -> tuple[Model, tuple[str, ...]]:

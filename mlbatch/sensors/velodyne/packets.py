@@ -10,12 +10,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from mlbatch.arrays import BoolArray, F64Array, I64Array, U8Array, U16Array
+from mlbatch.arrays import BoolArray, F64Array, I64Array, U8Array
 from mlbatch.lidar.content_keys import hash_factors
-from mlbatch.lidar.geometry import Projection, rotor_words
+from mlbatch.lidar.geometry import rotor_words
 from mlbatch.lidar.header_table import PacedBlocks
 from mlbatch.lidar.interface import FAULTS
 from mlbatch.lidar.pixel_table import PixelTable, readings
+from mlbatch.lidar.projections import CorrectedRanges
 from mlbatch.sensors.base import BaseLidar
 from mlbatch.sensors.velodyne.calibration import VelodyneFile
 from mlbatch.sensors.velodyne.clock import HOUR_NS, absolute_ns, top_of_hour_ns
@@ -35,7 +36,7 @@ from mlbatch.sensors.velodyne.models import (
     layout,
     ranks,
 )
-from mlbatch.types import ColumnHeaders, Pixels
+from mlbatch.types import ColumnHeaders
 from mlbatch.units import NS_PER_S
 
 VENDOR = "Velodyne"
@@ -108,9 +109,6 @@ class VelodyneLidar(BaseLidar):
         self.column_period_ns = measured.sequence_ns
         self.records = self._layout.records
         self._dark = np.zeros(0, np.int64) if file is None else (~file.enabled).nonzero()[0]
-        dark = str(self._dark.tolist())
-        kind = (VENDOR, model.lasers, model.banks, model.units_per_m, returns, dark)
-        self.pixel_layout: tuple[str | int | bool, ...] = kind
         self.pixels = PixelTable(
             3,
             readings(self._layout.first_byte, model.lasers, "<u2"),
@@ -153,28 +151,14 @@ class VelodyneLidar(BaseLidar):
             stamp_ns, rotor_words(revolutions, revolutions_per_s), np.ones(shape, np.bool_)
         )
 
-    def read(self, records: U8Array, which: int, out: Pixels) -> None:
-        """Decode return `which` of columns (n, records.size) into `out`, which may be strided."""
-        count = len(records)
-        lasers = self._layout.lasers_per_bank
-        for bank, byte in enumerate(self._layout.first_byte[which]):
-            channels = slice(bank * lasers, (bank + 1) * lasers)
-            raw: U16Array = np.ndarray(
-                (count, lasers), "<u2", buffer=records, offset=byte, strides=(records.strides[0], 3)
-            )
-            np.divide(raw, np.float32(self._model.units_per_m), out=out.range_m[:, channels])
-            out.intensity[:, channels] = records[:, byte + 2 : byte + 3 * lasers : 3]
-        if len(self._dark):
-            out.range_m[:, self._dark] = 0
-
-    def projection(self, body_from_sensor: F64Array, columns: int) -> Projection | None:
+    def projection(self, body_from_sensor: F64Array) -> CorrectedRanges | None:
         """Projection of the HDL-64E, whose corrections depend on the range; else None."""
         if not self._model.needs_file or self._file is None:
             return None
         file = self._file
         if not self._options.vertical_offset:
             file = replace(file, vert_offset_m=np.zeros_like(file.vert_offset_m))
-        return hdl64_projection(file, self.firing_ns, body_from_sensor, columns)
+        return hdl64_projection(file, body_from_sensor)
 
     def _header_table(self) -> PacedBlocks:
         """Layout of the headers for compiled loops."""

@@ -8,10 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mlbatch.arrays import F32Array, F64Array, I64Array
-from mlbatch.lidar.geometry import Projection, rotor_words
+from mlbatch.arrays import F64Array, I64Array
+from mlbatch.lidar.geometry import rotor_words
 from mlbatch.sensors.hesai.angles import At128File
 from mlbatch.sensors.hesai.at128 import at128_projection
+from tests.builders.decoded import Rotor, projected
 
 DEG = math.pi / 180
 CHANNELS = 128
@@ -40,19 +41,16 @@ def words(rotor_deg: list[float], turns_per_s: float = 0.0) -> I64Array:
     return rotor_words(np.array(rotor_deg) / 360, np.full(len(rotor_deg), turns_per_s))
 
 
-def points(projection: Projection, encoder: I64Array, range_m: F32Array) -> F32Array:
-    projection.prepare(np.zeros(len(encoder), np.int64), encoder)
-    # As the core calls it: x, y, z are strided by the intensity.
-    wide = np.zeros((*range_m.shape, 4), np.float32)
-    projection.project(range_m, wide[:, :, :3])
-    assert not wide[:, :, 3].any()
-    return wide[:, :, :3]
+def beams(file: At128File, firing_ns: I64Array = NO_FIRING) -> Rotor:
+    """The beams of a file."""
+    return Rotor(firing_ns, project=lambda pose: at128_projection(file, pose))
 
 
 def point(rotor_deg: float, channel: int, range_m: float = 10.0) -> list[float]:
     ranges_m = np.full((1, CHANNELS), range_m, np.float32)
-    projection = at128_projection(plain_file(), NO_FIRING, np.eye(4), 4)
-    found: list[float] = points(projection, words([rotor_deg]), ranges_m)[0, channel].tolist()
+    found: list[float] = projected(beams(plain_file()), words([rotor_deg]), ranges_m)[
+        0, channel
+    ].tolist()
     return found
 
 
@@ -100,9 +98,10 @@ def test_beams_fire_while_the_rotor_rotates() -> None:
     # 200 rpm: 1.2 deg a ms. After 0.5 ms the rotor is 0.6 deg on, the beam 1.2.
     firing_ns = NO_FIRING.copy()
     firing_ns[0, 5] = 500_000
-    projection = at128_projection(plain_file(), firing_ns, np.eye(4), 1)
-    found = points(
-        projection, words([60.0], turns_per_s=200 / 60), np.ones((1, CHANNELS), np.float32)
+    found = projected(
+        beams(plain_file(), firing_ns),
+        words([60.0], turns_per_s=200 / 60),
+        np.ones((1, CHANNELS), np.float32),
     )
     azimuth = np.arctan2(found[0, :, 0], found[0, :, 1]) / DEG
     assert azimuth[4] == pytest.approx(60.0, abs=1e-4)
@@ -121,16 +120,16 @@ def test_beams_fire_while_the_rotor_rotates() -> None:
 )
 def test_beams_pass_a_step_while_firing(rotor: float, rpm: int, azimuth: float) -> None:
     firing_ns = np.full((1, CHANNELS), 500_000)
-    projection = at128_projection(plain_file(), firing_ns, np.eye(4), 1)
-    found = points(projection, words([rotor], rpm / 60), np.ones((1, CHANNELS), np.float32))
+    found = projected(
+        beams(plain_file(), firing_ns), words([rotor], rpm / 60), np.ones((1, CHANNELS), np.float32)
+    )
     assert math.atan2(found[0, 10, 0], found[0, 10, 1]) / DEG == pytest.approx(azimuth, abs=1e-4)
 
 
 def test_silent_beams_count_as_the_column_and_words_choose_the_table() -> None:
     firing_ns = np.stack([np.full(CHANNELS, -1), np.full(CHANNELS, 1_000_000)])
-    projection = at128_projection(plain_file(), firing_ns, np.eye(4), 2)
     encoder = rotor_words(np.full(2, 60 / 360), np.full(2, 200 / 60), np.array([0, 1]))
-    found = points(projection, encoder, np.ones((2, CHANNELS), np.float32))
+    found = projected(beams(plain_file(), firing_ns), encoder, np.ones((2, CHANNELS), np.float32))
     azimuth = np.arctan2(found[:, 0, 0], found[:, 0, 1]) / DEG
     assert azimuth == pytest.approx([60.0, 62.4], abs=1e-4)
 
@@ -140,8 +139,9 @@ def test_pose_turns_and_moves_the_points() -> None:
     pose = np.eye(4)
     pose[:3, :3] = [[0, -1, 0], [1, 0, 0], [0, 0, 1]]
     pose[:3, 3] = [1, 2, 3]
-    projection = at128_projection(plain_file(), NO_FIRING, pose, 1)
-    found = points(projection, words([75.0]), np.full((1, CHANNELS), 10, np.float32))
+    found = projected(
+        beams(plain_file()), words([75.0]), np.full((1, CHANNELS), 10, np.float32), pose
+    )
     assert found[0, 0].tolist() == pytest.approx([1, 12, 3], abs=2e-6)
 
 

@@ -12,7 +12,8 @@ from mlbatch.arrays import F32Array, F64Array, I64Array, U8Array
 from mlbatch.errors import RigError, UsageError
 from mlbatch.lidar.interface import FAULTS, Evidence
 from mlbatch.sensors.livox import sensor as livox
-from mlbatch.types import Pixels, Stream
+from mlbatch.types import Stream
+from tests.builders.decoded import readings
 from tests.builders.livox import (
     CARTESIAN16,
     CARTESIAN32,
@@ -66,18 +67,8 @@ def decoded(
     packets: U8Array, pose: F64Array = STILL, which: int = 0
 ) -> tuple[F32Array, F32Array, F32Array]:
     """Points (n, 3), ranges (n,) and intensities (n,), as the core asks for them."""
-    lidar = sensor(packets)
-    where = lidar.records
-    ends = where.start + lidar.columns_per_packet * where.stride
-    records = np.ascontiguousarray(packets[:, where.start : ends]).reshape(-1, where.size)
-    count = len(records)
-    point = np.zeros((count, lidar.returns, 4), np.float32)
-    out = Pixels(np.zeros((count, 1), np.float32), point[:, which : which + 1, 3], None)
-    projection = lidar.projection(pose, count)
-    projection.prepare(np.zeros(count, np.int64), np.zeros(count, np.int64))
-    lidar.read(records, which, out)
-    projection.project(out.range_m, point[:, which : which + 1, :3])
-    return point[:, which, :3], out.range_m[:, 0], out.intensity[:, 0]
+    found = readings(sensor(packets), packets, body_from_sensor=pose)
+    return found.xyz[:, 0, which], found.range_m[:, 0, which], found.intensity[:, 0, which]
 
 
 def one_point(kind: int, *values: int) -> tuple[list[float], float]:
@@ -94,7 +85,6 @@ def one_point(kind: int, *values: int) -> tuple[list[float], float]:
         # 3, 4, 12 m: 13 m away.
         (CARTESIAN32, (3000, -4000, 12_000), (3.0, -4.0, 12.0), 13.0),
         (CARTESIAN32, (-1, 2, -2), (-0.001, 0.002, -0.002), 0.003),
-        (CARTESIAN32, (0, 0, 0), (0.0, 0.0, 0.0), 0.0),
         # Centimetres: 2, 3, 6 m.
         (CARTESIAN16, (200, -300, 600), (2.0, -3.0, 6.0), 7.0),
         (CARTESIAN16, (-32_768, 0, 0), (-327.68, 0.0, 0.0), 327.68),
@@ -112,6 +102,13 @@ def test_points_worked_by_hand(
     found_m, found_range_m = one_point(kind, *values)
     assert found_m == pytest.approx(xyz_m, rel=1e-7, abs=2e-6)
     assert found_range_m == np.float32(range_m)
+
+
+@pytest.mark.parametrize("kind", [CARTESIAN32, CARTESIAN16, SPHERICAL])
+def test_a_point_at_the_origin_is_no_return(kind: int) -> None:
+    found_m, found_range_m = one_point(kind, 0, 0, 0)
+    assert np.isnan(found_m).all()
+    assert found_range_m == 0
 
 
 def test_a_point_of_two_returns() -> None:
@@ -183,7 +180,6 @@ def test_attributes() -> None:
     assert (lidar.packet_size, lidar.records.start, lidar.records.size) == (1380, 36, 28)
     assert lidar.timestamp_mode == "time since power-on"
     assert (lidar.return_types, lidar.imu_port, lidar.notes) == ((0, 0), 56401, ())
-    assert lidar.pixel_layout != sensor(random_packets(LivoxSpec())[2]).pixel_layout
     assert lidar.sent_by_me(packets).all()
     assert [model.name for model in livox.MODELS] == ["Livox SDK2"]
 

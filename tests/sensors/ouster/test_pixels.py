@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from itertools import product
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 import pytest
@@ -12,10 +13,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mlbatch.arrays import U8Array
-from mlbatch.sensors.ouster.pixels import PixelReader
+from mlbatch.lidar.interface import Lidar
 from mlbatch.sensors.ouster.profiles import HEADER_TYPES, HEADERS, OFF, PROFILES, PacketLayout
 from mlbatch.sensors.ouster.sensor import OusterLidar, read_calibration
-from mlbatch.types import Pixels
+from tests.builders.decoded import readings
 from tests.builders.ouster import IntLike, OusterSpec, encode_packets, metadata_json
 from tests.reference import ouster as reference
 
@@ -83,12 +84,6 @@ def records_of(lidar: OusterLidar, packets: U8Array) -> U8Array:
     return np.ascontiguousarray(body.reshape(-1, lidar.records.size))
 
 
-def blank(shape: tuple[int, int]) -> Pixels:
-    return Pixels(
-        np.full(shape, 9, np.float32), np.full(shape, 9, np.float32), np.full(shape, 9, np.uint16)
-    )
-
-
 def test_all_profiles_are_checked_by_hand() -> None:
     assert set(BY_HAND) == set(NAMES) == set(SIZES)
 
@@ -120,51 +115,35 @@ def test_sizes_of_packets(name: str) -> None:
 def test_a_pixel_worked_by_hand(name: str) -> None:
     text, returns = BY_HAND[name]
     pixel = bytes.fromhex(text)
-    beams, at = 16, 5
-    head, tail = (16, 4) if name == "LEGACY" else (12, 0)
-    column = bytes([0xEE] * head) + bytes(len(pixel) * beams) + bytes([0xEE] * tail)
-    records = np.frombuffer(column, np.uint8).copy()[None, :].repeat(3, axis=0)
+    spec = OusterSpec(profile=name, beams=16)
+    lidar, at = lidar_of(spec), 5
+    packets = two_packets(spec)
+    head = 16 if name == "LEGACY" else 12
+    columns = packets[:, lidar.records.start :][:, : 16 * lidar.records.size].reshape(2, 16, -1)
+    columns[:, :, head : head + 16 * len(pixel)] = 0
     first = head + at * len(pixel)
-    records[1, first : first + len(pixel)] = np.frombuffer(pixel, np.uint8)
-    reader = PixelReader(PacketLayout(PROFILES[name], beams, 16))
+    columns[1, 3, first : first + len(pixel)] = np.frombuffer(pixel, np.uint8)
+    found = readings(cast(Lidar, lidar), packets)
+    assert found.reflectivity is not None
+    assert found.range_m.shape == (32, 16, len(returns))
     for which, (range_mm, reflectivity, intensity) in enumerate(returns):
-        out = blank((3, beams))
-        reader.read(records, which, out)
-        assert out.reflectivity is not None
-        assert out.range_m[1, at] == np.float32(range_mm / 1000)
-        assert out.reflectivity[1, at] == reflectivity
-        assert out.intensity[1, at] == intensity
-        for plane in (out.range_m, out.reflectivity, out.intensity):
-            assert np.count_nonzero(plane) == 1
+        assert found.range_m[19, at, which] == np.float32(range_mm / 1000)
+        assert found.reflectivity[19, at, which] == reflectivity
+        assert found.intensity[19, at, which] == intensity
+    for plane in (found.range_m, found.reflectivity, found.intensity):
+        assert np.count_nonzero(plane) == len(returns)
 
 
 def test_every_coarse_range_is_rounded_correctly() -> None:
-    raw = np.arange(2**15, dtype="<u4").reshape(-1, 16)
-    records = np.zeros((len(raw), 12 + 64), np.uint8)
-    records[:, 12:] = raw.view(np.uint8).reshape(len(raw), -1)
-    out = blank(raw.shape)
-    PixelReader(PacketLayout(PROFILES["RNG15_RFL8_NIR8"], 16, 16)).read(records, 0, out)
+    spec = OusterSpec(profile="RNG15_RFL8_NIR8", beams=128)
+    raw = np.arange(2**15).reshape(-1, 128)
+    mids = np.arange(len(raw))
+    sent = encode_packets(spec, mids, mids, np.zeros(len(raw), np.int64), {"RANGE": raw << 3})
+    found = readings(cast(Lidar, lidar_of(spec)), stacked(sent)).range_m
     # Python divides the exact integers; the second rounding cannot err, 53 bits being enough.
-    expected = [np.float32(8 * value / 1000) for value in raw.ravel().tolist()]
-    assert out.range_m.ravel().tolist() == [float(value) for value in expected]
-    assert out.range_m.max() == np.float32(262.136)
-
-
-def test_outputs_may_be_strided_and_reflectivity_left_out() -> None:
-    rng = np.random.default_rng(5)
-    layout = PacketLayout(PROFILES["RNG19_RFL8_SIG16_NIR16_DUAL"], 32, 16)
-    records = rng.integers(0, 256, (20, layout.record_size), np.uint8)
-    reader = PixelReader(layout)
-    for count in (20, 3, 0):
-        plain = blank((count, 32))
-        reader.read(records[:count], 1, plain)
-        wide = np.zeros((count, 64, 4), np.float32)
-        planes = Pixels(wide[:, 1::2, 0], wide[:, 1::2, 3], None)
-        reader.read(records[:count], 1, planes)
-        assert np.array_equal(planes.range_m, plain.range_m)
-        assert np.array_equal(planes.intensity, plain.intensity)
-        assert not wide[:, 0::2].any()
-        assert not wide[:, :, 1:3].any()
+    expected = [float(np.float32(8 * value / 1000)) for value in raw.ravel().tolist()]
+    assert found.ravel().tolist() == expected
+    assert found.max() == np.float32(262.136)
 
 
 def combinations() -> list[OusterSpec]:
@@ -204,13 +183,17 @@ def test_encode_then_decode_is_identity(
     assert np.array_equal(headers.stamp_ns.ravel(), stamps)
     assert np.array_equal(headers.encoder.ravel(), mids)
     assert np.array_equal(headers.valid.ravel(), valid)
+    found = readings(cast(Lidar, lidar), packets)
+    assert found.reflectivity is not None
     for which, suffix in enumerate(("", "2")[: lidar.returns]):
-        out = blank(shape)
-        lidar.read(records_of(lidar, packets), which, out)
+        range_m = (fields[f"RANGE{suffix}"] / 1000).astype(np.float32)
         intensity = fields.get(f"SIGNAL{suffix}", fields[f"REFLECTIVITY{suffix}"])
-        assert np.array_equal(out.range_m, (fields[f"RANGE{suffix}"] / 1000).astype(np.float32))
-        assert np.array_equal(out.intensity, intensity)
-        assert np.array_equal(np.asarray(out.reflectivity), fields[f"REFLECTIVITY{suffix}"])
+        assert np.array_equal(found.range_m[..., which], range_m)
+        # Slots without a return are empty.
+        is_met = range_m > 0
+        assert np.array_equal(found.intensity[..., which], intensity * is_met)
+        levels = fields[f"REFLECTIVITY{suffix}"] * is_met
+        assert np.array_equal(found.reflectivity[..., which], levels)
 
 
 def two_packets(spec: OusterSpec, frame: int = 7, first: int = 0) -> U8Array:

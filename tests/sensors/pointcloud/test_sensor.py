@@ -11,13 +11,13 @@ import pytest
 import mlbatch
 from mlbatch import sensors
 from mlbatch.arrays import F32Array, F64Array, U8Array
-from mlbatch.decode.packet_ring import PacketRing
 from mlbatch.errors import RigError, UsageError
 from mlbatch.frames.transforms import from_quaternion
 from mlbatch.lidar.interface import FAULTS, Calibration, Evidence, Lidar
 from mlbatch.ros.point_packets import Layout, Points, layout_of, pack
 from mlbatch.sensors.pointcloud.sensor import BUILT_IN, MODELS
-from mlbatch.types import Pixels, Stream
+from mlbatch.types import Stream
+from tests.builders.decoded import readings
 from tests.builders.points import STAMP_NS, VELODYNE, cloud_message, write_points
 from tests.builders.rosbag2 import write_rosbag2
 
@@ -151,23 +151,10 @@ def test_equal_columns_of_a_message_are_two_and_of_two_messages_one() -> None:
 
 
 def _decoded(pose: F64Array) -> tuple[F32Array, F32Array, F32Array]:
-    """Ranges (n, B), places (n, B, 3) and levels (n, B) by way of the ring."""
-    packets, layout = _packets()
-    lidar = _lidar()
-    ring = PacketRing(lidar.packet_size, lidar.records)
-    data = packets.reshape(-1)
-    _, place = ring.store(data, np.arange(len(packets)) * layout.size, None)
-    records = np.empty((len(packets), lidar.records.size), np.uint8)
-    ring.gather(place, records)
-    point = np.full((len(packets), 2, 4), np.nan, np.float32)
-    range_m = np.full((len(packets), 2), np.nan, np.float32)
-    projection = lidar.projection(pose, len(packets))
-    assert projection is not None
-    none = np.zeros(len(packets), np.int64)
-    projection.prepare(none, none)
-    lidar.read(records, 0, Pixels(range_m, point[..., 3], None))
-    projection.project(range_m, point[..., :3])
-    return range_m, point[..., :3], point[..., 3]
+    """Ranges (n, B), places (n, B, 3) and levels (n, B)."""
+    packets, _ = _packets()
+    found = readings(_lidar(), packets, body_from_sensor=pose)
+    return found.range_m[..., 0], found.xyz[..., 0, :], found.intensity[..., 0]
 
 
 def test_points_stay_where_they_are_in_their_own_frame() -> None:
@@ -186,15 +173,6 @@ def test_points_are_turned_and_moved_into_the_body_frame() -> None:
     assert range_m.tolist() == RANGES_M
     expected = [(10 - y, 20 + x, 30 + z) for x, y, z in PLACES]
     np.testing.assert_allclose([*xyz[0], *xyz[1], xyz[2, 0]], expected, atol=2e-6)
-
-
-def test_topics_are_never_decoded_together() -> None:
-    """The places that were read last are those of one topic."""
-    packets, _ = _packets()
-    left, right = (
-        CLOUD.lidar({}, _evidence(packets, Stream(topic=topic))) for topic in ("/left", "/right")
-    )
-    assert left.pixel_layout != right.pixel_layout
 
 
 def test_columns_by_ring_are_named_so() -> None:

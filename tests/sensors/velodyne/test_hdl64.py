@@ -13,6 +13,7 @@ from mlbatch.arrays import F32Array, F64Array, I64Array
 from mlbatch.lidar.geometry import rotor_words
 from mlbatch.sensors.velodyne.calibration import VelodyneFile, read_velodyne
 from mlbatch.sensors.velodyne.hdl64 import hdl64_projection
+from tests.builders.decoded import Rotor, projected
 from tests.builders.velodyne_tables import calibration_yaml
 
 LASERS = 64
@@ -64,14 +65,9 @@ def project(
 ) -> F32Array:
     """Points (n, 64, 3) of columns at these rotor azimuths (n,)."""
     count = len(azimuth_deg)
-    projection = hdl64_projection(file, firing_ns, np.eye(4) if pose is None else pose, count + 3)
     words = rotor_words(azimuth_deg / 360, np.full(count, hz), np.full(count, table))
-    projection.prepare(np.zeros(count, np.int64), words)
-    # As in a scan: points are in rows with other fields behind them.
-    out = np.full((count, LASERS, 4), np.nan, np.float32)
-    projection.project(range_m.astype(np.float32), out[..., :3])
-    assert np.isnan(out[..., 3]).all()
-    return out[..., :3]
+    rotor = Rotor(firing_ns, project=lambda pose: hdl64_projection(file, pose))
+    return projected(rotor, words, range_m.astype(np.float32), pose)
 
 
 def project_one(laser: Laser, azimuth_deg: float, range_m: float) -> list[float]:

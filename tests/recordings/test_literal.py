@@ -1,4 +1,4 @@
-"""Both engines on real recordings, bit for bit."""
+"""Real recordings against the literal decoder."""
 
 from __future__ import annotations
 

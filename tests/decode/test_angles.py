@@ -6,12 +6,9 @@ import numpy as np
 import pytest
 
 from mlbatch.arrays import I64Array
-from mlbatch.decode import native_engine
-from mlbatch.decode.native_engine import native_angles
+from mlbatch.decode import engine
+from mlbatch.decode.engine import compiled_angles
 from mlbatch.lidar.geometry import rotor_angles
-from tests.builders.engines import needs_native
-
-pytestmark = needs_native
 
 REVOLUTION = 1 << 32
 HUNDREDTHS = np.rint(np.arange(36_000) * (REVOLUTION / 36_000)).astype(np.int64)
@@ -29,7 +26,7 @@ def random_words() -> I64Array:
 
 @pytest.mark.parametrize("words", [random_words(), HUNDREDTHS, NEAR_AXES, HUNDREDTHS[:0]])
 def test_angles_equal_those_of_numpy(words: I64Array) -> None:
-    for one, other in zip(rotor_angles(words), native_angles(words), strict=True):
+    for one, other in zip(rotor_angles(words), compiled_angles(words), strict=True):
         assert one.dtype == other.dtype
         assert one.tobytes() == other.tobytes()
 
@@ -41,9 +38,9 @@ def test_numpy_computes_angles_whose_last_bit_is_uncertain(monkeypatch: pytest.M
         asked.append(words)
         return rotor_angles(words)
 
-    monkeypatch.setattr(native_engine, "rotor_angles", noted)
-    native_angles(np.array([0, 1 << 28, 1 << 30, 1 << 31]))
+    monkeypatch.setattr(engine, "rotor_angles", noted)
+    compiled_angles(np.array([0, 1 << 28, 1 << 30, 1 << 31]))
     assert [words.tolist() for words in asked] == [[0, 1 << 30, 1 << 31]]
-    native_angles(random_words())
+    compiled_angles(random_words())
     # A few in a million.
     assert len(asked[1]) < 100

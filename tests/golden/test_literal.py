@@ -1,0 +1,43 @@
+"""Every model and mode, and the fixtures, against the literal decoder."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from mlbatch.discovery.discover import SensorSelection
+from mlbatch.pipeline.job import Job
+from tests.builders import four_makers
+from tests.builders.engines import WANTED, check_conversion
+from tests.builders.run import FIXTURE
+from tests.golden.test_every_model import CASES, Sent, job_of
+
+MAKERS = Job(
+    (four_makers.FOLDER / "four_makers.pcap",),
+    SensorSelection(rig=four_makers.FOLDER / "rig.yaml"),
+    keep_partial=True,
+)
+
+
+@pytest.mark.parametrize(
+    ("make", "words"),
+    CASES,
+    ids=[f"{make.__name__[:-5]} {' '.join(words)}" for make, words in CASES],
+)
+def test_every_model(make: Callable[..., Sent], words: tuple[str, ...], tmp_path: Path) -> None:
+    job = job_of(make(*words), tmp_path)
+    pairs = check_conversion(job)
+    everything, _, cut, near, *_ = (pair.decoder.counts[0] for pair in pairs)
+    assert everything.written > cut.written
+    assert cut.box > 0
+    assert near.written > 0
+    still = {"firing_azimuth": "off"}
+    check_conversion(replace(job, selection=replace(job.selection, decode=still)), WANTED[:1])
+
+
+@pytest.mark.parametrize("job", [FIXTURE, MAKERS], ids=["two lidars", "four makers"])
+def test_rigs(job: Job) -> None:
+    check_conversion(job)
