@@ -17,7 +17,7 @@ from mlbatch.errors import RecordingError
 from mlbatch.frames.transforms import inverse
 from mlbatch.motion.se3 import exp_rotation, rotated
 from mlbatch.motion.track import MAX_GAP_NS, PoseTrack
-from mlbatch.units import NS_PER_S, STANDARD_GRAVITY
+from mlbatch.units import NS_PER_MS, NS_PER_S, STANDARD_GRAVITY
 
 STANDSTILL_NS = NS_PER_S
 _LEAST_SAMPLES = 20
@@ -27,14 +27,23 @@ _MOST_FORCE = 0.5
 # Largest mean rate, rad/s: more than the bias of small gyroscopes (5 degrees/s), so a turn.
 _MOST_BIAS = 0.2
 _GRAVITY_TOLERANCE = 0.05
+# Of the body's z axis from the vertical at rest: no vehicle stands on a steeper slope.
+MOST_TILT_DEG = 30.0
+# Without samples for longer, velocity and attitude are not known any more.
+_MOST_GAP_PERIODS = 3
+_LEAST_GAP_NS = 20 * NS_PER_MS
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Standstill:
-    """What the IMU measured at rest: gyro_bias (3,), rad/s; gravity (3,), m/s2, IMU frame."""
+    """What the IMU measured at rest, IMU frame; period_ns: between samples.
+
+    gyro_bias: (3,), rad/s; gravity: (3,), m/s2, upward.
+    """
 
     gyro_bias: F64Array
     gravity: F64Array
+    period_ns: int
 
 
 def standstill(stamp_ns: I64Array, force: F64Array, rate: F64Array, name: str) -> Standstill:
@@ -70,7 +79,20 @@ def standstill(stamp_ns: I64Array, force: F64Array, rate: F64Array, name: str) -
             f"{name}: expected {STANDARD_GRAVITY:.2f} m/s2 at rest, found {size:.3f}; check the "
             "units of the IMU"
         )
-    return Standstill(bias, gravity)
+    return Standstill(bias, gravity, int(np.median(np.diff(stamp_ns[rows]))))
+
+
+def check_upright(up: F64Array, name: str) -> None:
+    """RecordingError unless a specific force at rest (3,), body frame, points along z."""
+    tilt_deg = math.degrees(math.atan2(math.hypot(up[0], up[1]), up[2]))
+    # Rounded, so that a slope of just as much is not one more.
+    if round(tilt_deg, 6) > MOST_TILT_DEG:
+        found = " ".join(f"{value:.1f}" for value in up)
+        raise RecordingError(
+            f"{name}: expected +{STANDARD_GRAVITY:.2f} m/s2 within {MOST_TILT_DEG:.0f} degrees of "
+            f"the body's z axis at rest, found {found} m/s2, {tilt_deg:.0f} degrees from it; check "
+            "the sign of the accelerometer and the extrinsics of the IMU"
+        )
 
 
 @dataclass(slots=True)
@@ -97,8 +119,13 @@ class Integrator:
         self._begin_ns = 0
         self._state: _State | None = None
         self.gyro_bias: tuple[float, ...] = ()
-        # A longer gap than MAX_GAP_NS: the velocity is not known any more.
-        self.is_lost = False
+        # The gap that ended the integration.
+        self.gap_ns = 0
+
+    @property
+    def is_lost(self) -> bool:
+        """Whether a gap ended the integration."""
+        return self.gap_ns > 0
 
     def push(self, stamp_ns: I64Array, force: F64Array, rate: F64Array) -> PoseTrack:
         """Return the poses at samples (n,), none before the first second is complete.
@@ -114,6 +141,7 @@ class Integrator:
                 return self._track(stamp_ns[:0], np.zeros((0, 3, 3)), np.zeros((0, 3)))
             self._rest = standstill(stamp_ns, force, rate, self._name)
             self.gyro_bias = tuple(self._rest.gyro_bias.tolist())
+            check_upright(self._imu_from_body[:3, :3].T @ self._rest.gravity, self._name)
             self._begin_ns = int(stamp_ns[0])
             self._waiting = []
         if self.is_lost or len(stamp_ns) == 0:
@@ -130,9 +158,15 @@ class Integrator:
             first = int(stamp_ns[0])
             state = _State(_upright(rest.gravity), still, still, still, turning[0], first)
         stamps = np.concatenate([[state.stamp_ns], stamp_ns])
-        gaps = np.flatnonzero(np.diff(stamps) > MAX_GAP_NS)
+        steps_ns = np.diff(stamps)
+        # Half a period more, so that its jitter does not count.
+        most_ns = max(_LEAST_GAP_NS, _MOST_GAP_PERIODS * rest.period_ns) + rest.period_ns // 2
+        # Within the standstill nothing is missed.
+        moves = stamp_ns - self._begin_ns > STANDSTILL_NS
+        gaps = np.flatnonzero(steps_ns > np.where(moves, most_ns, MAX_GAP_NS))
         count = int(gaps[0]) if len(gaps) else len(stamp_ns)
-        self.is_lost = count < len(stamp_ns)
+        if len(gaps):
+            self.gap_ns = int(steps_ns[count])
         step_s: F64Array = np.diff(stamps[: count + 1]) / NS_PER_S
         rates = np.concatenate([state.turning[None], turning[:count]])
         # Mean angular velocity of each step.

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
+from mlbatch.arrays import F64Array
 from mlbatch.bounded import read_text
 from mlbatch.errors import RigError
 from mlbatch.motion.se3 import rotations_of
@@ -23,6 +24,10 @@ _TIME = re.compile(r"(\d{1,12})(?:\.(\d*))?", re.ASCII)
 _EXPONENT = re.compile(r"\d(?:\.\d+)?[eE][+]?\d{1,2}", re.ASCII)
 _VALUES = 8
 _DIGITS = 9
+# Tilt of the body's z axis: of a vehicle, and of one that lies on its side or its roof.
+_LEVEL_DEG = 20.0
+_LYING_DEG = 45.0
+_LEVEL_SHARE = 0.95
 # Of stamps: 2038; a count of ms, us or ns is beyond.
 _LATEST_NS = 2**31 * NS_PER_S
 
@@ -57,8 +62,24 @@ def read_tum(path: Path) -> PoseTrack:
         )
     table = np.array(rows)
     norm = np.sqrt((table[:, 3:] ** 2).sum(axis=1))
-    rotations = rotations_of(table[:, 3:] / norm[:, None])
+    quaternions = table[:, 3:] / norm[:, None]
+    rotations = rotations_of(quaternions)
+    _refuse_w_first(path, rotations, rotations_of(np.roll(quaternions, -1, axis=1)))
     return PoseTrack(np.array(stamps, np.int64), rotations, table[:, :3], path.name)
+
+
+def _refuse_w_first(path: Path, rotations: F64Array, others: F64Array) -> None:
+    """RigError if the body lies, but is level where quaternions are read as w, x, y, z.
+
+    rotations, others: (n, 3, 3), of both readings.
+    """
+    lying = float(np.mean(rotations[:, 2, 2] < math.cos(math.radians(_LYING_DEG))))
+    level = float(np.mean(others[:, 2, 2] > math.cos(math.radians(_LEVEL_DEG))))
+    if lying > 0.5 and level > _LEVEL_SHARE:
+        raise RigError(
+            f"{path}: expected quaternions as qx qy qz qw, found {100 * lying:.0f} % of the poses "
+            f"tilted by more than {_LYING_DEG:.0f} degrees, all level if w is first; write w last"
+        )
 
 
 def _values(place: str, words: list[str]) -> tuple[int, list[float]]:

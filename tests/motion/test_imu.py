@@ -12,7 +12,6 @@ from hypothesis import strategies as st
 from mlbatch.arrays import F64Array, I64Array
 from mlbatch.errors import RecordingError
 from mlbatch.motion.imu import Integrator, integrated
-from mlbatch.motion.track import MAX_GAP_NS
 from mlbatch.units import STANDARD_GRAVITY
 
 HZ = 100
@@ -100,17 +99,54 @@ def test_grouping_does_not_matter(cuts: list[int]) -> None:
         np.testing.assert_array_equal(joined, getattr(whole, name))
 
 
-def test_a_gap_ends_the_track() -> None:
-    stamps, force, rate = samples(4)
-    stamps[300:] += MAX_GAP_NS
+@pytest.mark.parametrize(
+    ("hz", "missing", "is_gap"),
+    # More than three periods, and 20 ms at least: 3 samples of 100 Hz, 4 of 200 Hz.
+    [(100, 2, False), (100, 3, True), (200, 3, False), (200, 4, True), (25, 3, True)],
+)
+def test_a_gap_ends_the_track(hz: int, missing: int, is_gap: bool) -> None:
+    stamps = START + np.arange(4 * hz) * (S // hz)
+    kept = (np.arange(4 * hz) < 3 * hz) | (np.arange(4 * hz) >= 3 * hz + missing)
+    stamps = stamps[kept]
+    force, rate = np.tile(UP, (len(stamps), 1)), np.zeros((len(stamps), 3))
     track = integrated(stamps, force, rate, np.eye(4))
-    assert len(track.stamp_ns) == 300
+    assert len(track.stamp_ns) == (3 * hz if is_gap else len(stamps))
     integrator = Integrator(np.eye(4))
-    integrator.push(stamps[:200], force[:200], rate[:200])
+    integrator.push(stamps[: 3 * hz], force[: 3 * hz], rate[: 3 * hz])
     assert not integrator.is_lost
-    integrator.push(stamps[200:350], force[200:350], rate[200:350])
-    assert integrator.is_lost
-    assert not len(integrator.push(stamps[350:], force[350:], rate[350:]).stamp_ns)
+    integrator.push(stamps[3 * hz :], force[3 * hz :], rate[3 * hz :])
+    assert integrator.is_lost == is_gap
+    assert integrator.gap_ns == (is_gap * (missing + 1) * S // hz)
+    # Nothing is known after it.
+    later = integrator.push(stamps[-1:] + S // hz, force[-1:], rate[-1:])
+    assert len(later.stamp_ns) == (not is_gap)
+
+
+def test_a_gap_at_rest_is_none() -> None:
+    """0.2 s of the first second, in which the body stands."""
+    stamps, force, rate = samples(4)
+    kept = (stamps < START + S // 2) | (stamps > START + 7 * S // 10)
+    track = integrated(stamps[kept], force[kept], rate[kept], np.eye(4))
+    assert len(track.stamp_ns) == int(kept.sum())
+
+
+@pytest.mark.parametrize(
+    ("up", "tilt"),
+    [((0, 0, -1), 180), ((1, 0, 0), 90), ((0, -0.6, 0.8), 37)],
+)
+def test_gravity_points_up_in_the_body(up: tuple[float, ...], tilt: int) -> None:
+    """An accelerometer with the other sign, or another frame; 30 degrees are a slope."""
+    stamps, force, rate = samples(2)
+    force = np.tile(STANDARD_GRAVITY * np.array(up, np.float64), (len(force), 1))
+    message = rf"front: expected \+9\.81 m/s2 within 30 degrees .*, {tilt} degrees from it; check"
+    with pytest.raises(RecordingError, match=message):
+        integrated(stamps, force, rate, np.eye(4), "front")
+    # Upright in the body: the IMU is mounted so.
+    up_of_imu = np.array(up, np.float64)
+    body_from_imu = np.eye(4)
+    across = np.array([0.0, 1.0, 0.0]) if up[1] == 0 else np.array([1.0, 0.0, 0.0])
+    body_from_imu[:3, :3] = [across, np.cross(up_of_imu, across), up_of_imu]
+    integrated(stamps, force, rate, body_from_imu)
 
 
 @pytest.mark.parametrize(
