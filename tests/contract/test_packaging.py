@@ -93,7 +93,7 @@ def test_the_lowest_versions_are_those_that_are_tested() -> None:
     bounds = {one[1]: one[2] for one in found if one is not None}
     lines = (ROOT / ".ci" / "lowest.txt").read_text(encoding="utf-8").splitlines()
     tested = dict(line.split("==") for line in lines if not line.startswith("#"))
-    optional = [*cast(list[str], extras["fast"]), *cast(list[str], extras["las"])]
+    optional = cast(list[str], extras["las"])
     needed = [*cast(list[str], lists[0]), *optional, "dpkt"]
     names = [re.split(r"[^\w-]", text, maxsplit=1)[0] for text in needed]
     assert tested == {name: bounds[name] for name in names}
