@@ -53,8 +53,7 @@ class MotionLedger:
     """What was moved; source: of the poses; to: instant of the window, as `--deskew-to`.
 
     poses: how many were used; windows_without_poses: left out, with `no_pose` columns; gyro_bias:
-    rad/s, of IMU poses; ended: why there are no later poses; velocity: of velocities instead of
-    poses.
+    rad/s, of IMU poses; velocity: of velocities instead of poses.
     """
 
     source: str
@@ -65,7 +64,6 @@ class MotionLedger:
     no_pose: int = 0
     windows_without_poses: int = 0
     gyro_bias: tuple[float, ...] = field(default=())
-    ended: str = ""
     velocity: VelocityCounts | None = None
 
     def as_json(self) -> dict[str, Json]:

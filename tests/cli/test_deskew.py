@@ -4,15 +4,10 @@ from __future__ import annotations
 
 import json
 import math
-import struct
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any, cast
 
 import numpy as np
 import pytest
-from mcap.reader import make_reader
-from mcap.writer import Writer
 
 import mlbatch
 from tests.builders.sessions import FIXTURE, REPOSITORY, Arrays, Shell, arrays, names, report_of
@@ -270,83 +265,3 @@ def test_an_imu_beyond_a_vehicle_is_refused(shell: Shell, x: float, is_refused: 
     if is_refused:
         assert done.err.startswith("mlbatch: error: --deskew imu: the IMU /imu/data: expected it ")
         assert "within 20 m of the body origin, found 188.003 m; give its static" in done.err
-
-
-IMU_WORDS = "convert rec.mcap --rig rec.rig.yaml -o out --deskew imu -q --keep-partial"
-
-
-def _with_imu(shell: Shell, change: Callable[[int, int], int | None]) -> None:
-    """A VLP-16 and an IMU of 200 Hz at rest for 2.5 s; change: header time of a sample, or None.
-
-    It is given the number of the sample and its time, ns.
-    """
-    sensors = "  - {name: top, model: VLP-16, extrinsics: {translation_m: [0, 0, 2]}}\n"
-    text = scenario_text(sensors, motion="", duration=2.5, more="imu: {rate_hz: 200}\n")
-    Path("scenario.yaml").write_text(text, encoding="utf-8")
-    assert shell("simulate scenario.yaml -o whole.mcap").code == 0
-    with Path("whole.mcap").open("rb") as source, Path("rec.mcap").open("wb") as target:
-        reader, writer = make_reader(source), Writer(target)
-        writer.start("ros2", "test")
-        channels: dict[str, int] = {}
-        number = 0
-        for schema, channel, message in reader.iter_messages():
-            data = message.data
-            if channel.topic not in channels:
-                kind = 0
-                if schema is not None:
-                    kind = writer.register_schema(schema.name, schema.encoding, schema.data)
-                channels[channel.topic] = writer.register_channel(
-                    channel.topic, channel.message_encoding, kind, dict(channel.metadata)
-                )
-            if channel.topic == "/imu/data":
-                stamp_s, stamp_ns = struct.unpack_from("<iI", data, 4)
-                changed = change(number, stamp_s * NS + stamp_ns)
-                number += 1
-                if changed is None:
-                    continue
-                data = data[:4] + struct.pack("<iI", *divmod(changed, NS)) + data[12:]
-            writer.add_message(
-                channels[channel.topic], message.log_time, data, message.publish_time
-            )
-        cast(Any, writer).finish()
-    Path("whole.rig.yaml").rename("rec.rig.yaml")
-
-
-def test_an_imu_on_another_clock_moves_nothing(shell: Shell) -> None:
-    """Its messages would be dropped (`imu_clock`), so that they are no poses, either."""
-    _with_imu(shell, lambda number, stamp_ns: stamp_ns + 2 * NS)
-    done = shell(IMU_WORDS)
-    assert done.code == 1
-    assert done.err.startswith(
-        "mlbatch: error: --deskew imu: /imu/data: expected the clock of its header and that of "
-        "the scans within 1 s of each other, found the scans -2.00"
-    )
-    assert not Path("out").exists()
-
-
-def test_windows_after_a_gap_of_the_imu_have_no_poses(shell: Shell) -> None:
-    """Samples 400 to 419 are missing: 105 ms, after 2 s."""
-    _with_imu(shell, lambda number, stamp_ns: None if 400 <= number < 420 else stamp_ns)
-    done = shell(IMU_WORDS)
-    assert (done.code, "no_pose" in done.warnings) == (0, True)
-    assert "after a gap of its samples of 105 ms" in done.err
-    report = report_of("out/report.json")
-    (sensor,) = report["sensors"]
-    dropped = sensor["columns"]["dropped"]
-    assert sensor["columns"]["decoded"] == sensor["columns"]["written"] + sum(dropped.values())
-    # From the window of the gap on: 0.5 s of 2.5 s.
-    assert 0.15 < dropped["no_pose"] / sensor["columns"]["decoded"] < 0.25
-    last = arrays(str(sorted(Path("out").glob("*.npz"))[-1]))
-    first = arrays("out/000000.npz")
-    assert int(last["end_ns"]) - int(first["start_ns"]) <= 2.1 * NS
-
-
-@pytest.mark.parametrize("missing", [3, 2])
-def test_single_samples_of_the_imu_may_be_missing(shell: Shell, missing: int) -> None:
-    """Up to three periods, and 20 ms, are bridged: each gap has 15 or 20 ms."""
-    _with_imu(
-        shell, lambda number, stamp_ns: None if 50 <= number % 100 < 50 + missing else stamp_ns
-    )
-    done = shell(IMU_WORDS)
-    assert done.code == 0, done.err
-    assert "after a gap" not in done.err
