@@ -25,11 +25,11 @@ _NOTHING = 1e-9
 class PoseLine:
     """Poses of the body in order of time; new ones are added at the end.
 
-    poses: how many were added.
+    track: those that are kept; poses: how many were added.
     """
 
     def __init__(self, track: PoseTrack) -> None:
-        self._track = track
+        self.track = track
         # Of each pair of poses, when it is added: a pair is in two windows or more.
         self._terms, self._angle = _pair_terms(track.rotation, track.position_m)
         self.poses = len(track.stamp_ns)
@@ -37,12 +37,12 @@ class PoseLine:
     @property
     def newest_ns(self) -> int | None:
         """Time of the last pose; None without a pose."""
-        stamps = self._track.stamp_ns
+        stamps = self.track.stamp_ns
         return int(stamps[-1]) if len(stamps) else None
 
     def extend(self, track: PoseTrack, keep_ns: int) -> None:
         """Add later poses; forget those before `keep_ns` but one."""
-        own = self._track
+        own = self.track
         first = max(0, int(own.stamp_ns.searchsorted(keep_ns, "right")) - 1)
         self.poses += len(track.stamp_ns)
         before = slice(len(own.stamp_ns) - 1, None) if len(own.stamp_ns) else slice(0)
@@ -52,7 +52,7 @@ class PoseLine:
         )
         self._terms = np.concatenate([self._terms[first:], terms])
         self._angle = np.concatenate([self._angle[first:], angle])
-        self._track = PoseTrack(
+        self.track = PoseTrack(
             np.concatenate([own.stamp_ns[first:], track.stamp_ns]),
             np.concatenate([own.rotation[first:], track.rotation]),
             np.concatenate([own.position_m[first:], track.position_m]),
@@ -63,14 +63,14 @@ class PoseLine:
     def has_poses(self, stamp_ns: I64Array, to_ns: int) -> bool:
         """Whether there is a pose at all times (n,), which increase, and at `to_ns`."""
         begin, end = self._span(stamp_ns, to_ns)
-        stamps = self._track.stamp_ns
+        stamps = self.track.stamp_ns
         if not len(stamps) or stamps[0] > begin or stamps[-1] < end:
             return False
         inside = np.append(stamp_ns, to_ns)
         after = stamps.searchsorted(inside, "left")
         is_between = stamps[after] != inside
         gap_ns = stamps[after] - stamps[np.maximum(after - 1, 0)]
-        return not bool((is_between & (gap_ns > self._track.max_gap_ns)).any())
+        return not bool((is_between & (gap_ns > self.track.max_gap_ns)).any())
 
     def moves(self, stamp_ns: I64Array, to_ns: int) -> F32Array | None:
         """Return body_at_instant from body_at_column, (n, 3, 4) m, of columns that have poses.
@@ -79,11 +79,11 @@ class PoseLine:
         """
         begin_ns, end_ns = self._span(stamp_ns, to_ns)
         around = self._around(begin_ns, end_ns)
-        poses = self._track.stamp_ns[around]
+        poses = self.track.stamp_ns[around]
         pairs = slice(around.start, around.stop - 1)
         terms, angle = self._terms[pairs].reshape(-1, 5, 3, 4).copy(), self._angle[pairs]
         # Relative to the first pose: far from the origin little would be left of a difference.
-        position_m = self._track.position_m[around]
+        position_m = self.track.position_m[around]
         terms[:, 0, :, 3] += position_m[:-1] - position_m[0]
         # The instant as a column more.
         times = np.append(stamp_ns, to_ns)
@@ -108,7 +108,7 @@ class PoseLine:
 
     def _around(self, begin_ns: int, end_ns: int) -> slice:
         """The poses around a span of time, two at least."""
-        stamps = self._track.stamp_ns
+        stamps = self.track.stamp_ns
         low = max(0, int(stamps.searchsorted(begin_ns, "right")) - 1)
         high = min(len(stamps), int(stamps.searchsorted(end_ns, "left")) + 1)
         low = max(0, min(low, high - 2))

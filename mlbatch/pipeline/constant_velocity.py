@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -29,64 +30,58 @@ CONSTANT_VELOCITY = "constant-velocity"
 _SLOTS = 1 << 16
 
 
-class ConstantVelocity:
-    """Takes windows, yields them with the transforms of their columns, or without."""
+class WindowCloud(NamedTuple):
+    """The points of a window; start_ns, end_ns: of it; slices: that it was cut to."""
 
-    # No window is left out, and nothing is integrated.
-    integrated_s = 0.0
+    cloud: Cloud
+    start_ns: int
+    end_ns: int
+    slices: list[Window]
 
-    def __init__(
-        self, to: str, grid: Grid, slots: list[int], new_decoder: Callable[[], Decoder]
-    ) -> None:
-        """to: a word of INSTANTS; slots: of a column of each sensor.
+
+class WindowPoints:
+    """Takes windows or their slices, reads points of some columns, yields whole windows."""
+
+    def __init__(self, grid: Grid, slots: list[int], new_decoder: Callable[[], Decoder]) -> None:
+        """slots: of a column of each sensor.
 
         new_decoder: called with the first window; its scans are dense, with `column`.
         """
-        self._to = to
         self._grid = grid
         self._slots = slots
         self._new_decoder = new_decoder
         self._decoder: Decoder | None = None
-        self._estimator = VelocityEstimator()
         # Slices of the window that is not complete, and their points.
         self._slices: list[Window] = []
         self._clouds: list[Cloud] = []
-        self._counts = MotionLedger(CONSTANT_VELOCITY, to, velocity=VelocityCounts())
-        self.dropped = [0] * len(slots)
 
-    def add(self, imu: Iterable[ImuSamples], messages: Iterable[Message]) -> None:
-        """Nothing: only points are used."""
-
-    def push(self, window: Window) -> Iterator[Window]:
-        """Add the next window or slice; yield all slices of those that are complete."""
+    def add(self, window: Window) -> Iterator[WindowCloud]:
+        """Add the next window or slice; yield windows that are complete."""
         if self._slices and self._slices[-1].index != window.index:
-            yield from self._release()
+            yield from self.release()
         self._slices.append(window)
         self._clouds.append(self._points(window))
         if window.slice == self._grid.slices - 1:
-            yield from self._release()
+            yield from self.release()
 
-    def finish(self) -> Iterator[Window]:
-        """End of input."""
-        yield from self._release()
-
-    def awaits(self, newest_ns: int) -> bool:
-        """False: a window needs nothing that is recorded after it."""
-        return False
+    def release(self) -> Iterator[WindowCloud]:
+        """The window that waits for slices."""
+        if not self._slices:
+            return
+        slices, clouds = self._slices, self._clouds
+        self._slices, self._clouds = [], []
+        yield WindowCloud(_joined(clouds), *self._span_ns(slices[0]), slices)
 
     def oldest_ring_index(self, sensor: int) -> int | None:
         """First ring index of a sensor in the slices that wait; None: none."""
         parts = (one.columns.ring_index[one.columns.sensor == sensor] for one in self._slices)
         return min((int(part.min()) for part in parts if len(part)), default=None)
 
-    @property
-    def ledger(self) -> MotionLedger:
-        """Counts so far."""
-        return self._counts
-
     def _span_ns(self, window: Window) -> tuple[int, int]:
-        """Start and end of the whole window that a slice belongs to."""
+        """Start and end of the whole window that a slice belongs to; of a set of sweeps its own."""
         slices = self._grid.slices
+        if slices == 1:
+            return window.start_ns, window.end_ns
         number = self._grid.index_of(window.start_ns) // slices
         return self._grid.bound(number * slices), self._grid.bound((number + 1) * slices)
 
@@ -112,14 +107,51 @@ class ConstantVelocity:
             raise TypeError("expected scans with columns")
         return Cloud(scan.xyz.astype(np.float64), scan.column.astype(np.int64), time_s)
 
-    def _release(self) -> Iterator[Window]:
-        if not self._slices:
-            return
-        slices, clouds = self._slices, self._clouds
-        self._slices, self._clouds = [], []
-        start_ns, end_ns = self._span_ns(slices[0])
+
+class ConstantVelocity:
+    """Takes windows, yields them with the transforms of their columns, or without."""
+
+    # No window is left out, and nothing is integrated.
+    integrated_s = 0.0
+
+    def __init__(self, to: str, points: WindowPoints, sensors: int) -> None:
+        """to: a word of INSTANTS; points: what reads the points of windows."""
+        self._to = to
+        self._points = points
+        self._estimator = VelocityEstimator()
+        self._counts = MotionLedger(CONSTANT_VELOCITY, to, velocity=VelocityCounts())
+        self.dropped = [0] * sensors
+
+    def add(self, imu: Iterable[ImuSamples], messages: Iterable[Message]) -> None:
+        """Nothing: only points are used."""
+
+    def push(self, window: Window) -> Iterator[Window]:
+        """Add the next window or slice; yield all slices of those that are complete."""
+        for whole in self._points.add(window):
+            yield from self._moved(whole)
+
+    def finish(self) -> Iterator[Window]:
+        """End of input."""
+        for whole in self._points.release():
+            yield from self._moved(whole)
+
+    def awaits(self, newest_ns: int) -> bool:
+        """False: a window needs nothing that is recorded after it."""
+        return False
+
+    def oldest_ring_index(self, sensor: int) -> int | None:
+        """First ring index of a sensor in the slices that wait; None: none."""
+        return self._points.oldest_ring_index(sensor)
+
+    @property
+    def ledger(self) -> MotionLedger:
+        """Counts so far."""
+        return self._counts
+
+    def _moved(self, whole: WindowCloud) -> Iterator[Window]:
+        cloud, start_ns, end_ns, slices = whole
         middle_ns = (start_ns + end_ns) // 2
-        estimate = self._estimator.add(_joined(clouds), middle_ns, end_ns - start_ns)
+        estimate = self._estimator.add(cloud, middle_ns, end_ns - start_ns)
         self._count(estimate, slices)
         if estimate.velocity is None:
             yield from slices

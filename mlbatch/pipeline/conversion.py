@@ -29,7 +29,7 @@ from mlbatch.pipeline.session import Session
 from mlbatch.pipeline.time_limits import refuse_outside
 from mlbatch.report.ledger import PointCounts
 from mlbatch.report.scan_table import ScanTable
-from mlbatch.types import BYTE_INTENSITY, ImuSamples, Message, RunInfo, Scan
+from mlbatch.types import BYTE_INTENSITY, ImuSamples, Message, RunInfo, Scan, Topic
 from mlbatch.units import NS_PER_MS, NS_PER_S, rate_text
 
 if TYPE_CHECKING:
@@ -41,6 +41,8 @@ if TYPE_CHECKING:
 # Called with the bytes read so far, those of all recordings, and the number of scans so far.
 Progress = Callable[[int, int, int], None]
 Item = TypeVar("Item")
+# Timescales on which messages of an IMU are comparable with scans.
+_EPOCH_SCALES = ("utc", "tai")
 
 
 @dataclass(slots=True)
@@ -164,19 +166,31 @@ class Conversion:
         job = self.job
         if not job.deskew:
             return None
-        from mlbatch.pipeline.constant_velocity import CONSTANT_VELOCITY, ConstantVelocity
+        from mlbatch.pipeline.constant_velocity import (
+            CONSTANT_VELOCITY,
+            ConstantVelocity,
+            WindowPoints,
+        )
 
+        slots = [sensor.source().slots for sensor in self.sensors]
+        points = WindowPoints(self.grid, slots, self._plain_decoder)
         if job.deskew == CONSTANT_VELOCITY:
-            slots = [sensor.source().slots for sensor in self.sensors]
-            return ConstantVelocity(job.deskew_to, self.grid, slots, self._plain_decoder)
+            return ConstantVelocity(job.deskew_to, points, len(self.sensors))
         from mlbatch.pipeline.deskew import IMU, Deskew, ImuPoses, Trajectory
 
         source: PoseSource
         if job.deskew == IMU:
-            source = ImuPoses(self.sensors, self.session.setup.frames())
+            source = ImuPoses(self.sensors, self.session.setup.frames(), self._topic_offset_ns)
         else:
             source = Trajectory(Path(job.deskew))
-        return Deskew(source, job.deskew_to, job.max_wait_ns, len(self.sensors))
+        return Deskew(source, job.deskew_to, job.max_wait_ns, points, len(self.sensors))
+
+    def _topic_offset_ns(self, topic: Topic) -> int | None:
+        """Scan clock minus receive time, as for messages of an IMU that are forwarded."""
+        if self.passthrough.messages.is_asked_for(topic):
+            return self._scan_offset_ns()
+        is_epoch = common_timescale(self._timescales()) in _EPOCH_SCALES
+        return self._scan_offset_ns() if is_epoch else None
 
     def _plain_decoder(self) -> Decoder:
         """A decoder for the thread that batches: dense scans of all sensors, with columns."""
@@ -408,7 +422,7 @@ class Conversion:
 
     def _clock_offset_ns(self) -> int | None:
         """Scan clock minus receive time; None where scans are not on an epoch clock."""
-        if self.info is None or self.info.timescale not in ("utc", "tai"):
+        if self.info is None or self.info.timescale not in _EPOCH_SCALES:
             return None
         return self._scan_offset_ns()
 

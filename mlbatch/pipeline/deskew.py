@@ -8,26 +8,29 @@ counted as `no_pose`.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Protocol
 
 import numpy as np
 
-from mlbatch.arrays import F64Array, I64Array
+from mlbatch.arrays import BoolArray, F64Array, I64Array
 from mlbatch.batching.windows import Window
-from mlbatch.errors import RigError
+from mlbatch.clocks.timescale import format_difference
+from mlbatch.errors import ClockError, RigError
 from mlbatch.lidar.limits import FAR_POSE_M
 from mlbatch.motion.imu import STANDSTILL_NS, Integrator
 from mlbatch.motion.moves import PoseLine
 from mlbatch.motion.track import PoseTrack
 from mlbatch.motion.tum import read_tum
-from mlbatch.pipeline.passthrough import IMU_TYPE
+from mlbatch.pipeline.constant_velocity import WindowPoints
+from mlbatch.pipeline.passthrough import IMU_TYPE, NEAR_NS
+from mlbatch.pipeline.rotation_check import RotationCheck
 from mlbatch.pipeline.sensor import Sensor
 from mlbatch.report.motion import MotionLedger
-from mlbatch.types import ImuSamples, Message, instant_ns
-from mlbatch.units import NS_PER_S
+from mlbatch.types import ImuSamples, Message, Topic, instant_ns
+from mlbatch.units import NS_PER_MS, NS_PER_S
 
 IMU = "imu"
 # What sets of sweeps may begin before the newest window, with room.
@@ -42,6 +45,11 @@ class PoseSource(Protocol):
     name: str
     line: PoseLine
     gyro_bias: tuple[float, ...]
+
+    @property
+    def ended(self) -> str:
+        """Why no poses will be added, if they should; else an empty text."""
+        ...
 
     @property
     def integrated_s(self) -> float:
@@ -67,6 +75,7 @@ class Trajectory:
 
     gyro_bias: tuple[float, ...] = ()
     is_complete = True
+    ended = ""
 
     def __init__(self, path: Path) -> None:
         track = read_tum(path)
@@ -86,8 +95,17 @@ class ImuPoses:
 
     gyro_bias: tuple[float, ...] = ()
 
-    def __init__(self, sensors: Sequence[Sensor], frames: dict[str, F64Array]) -> None:
-        """frames: (4, 4) body_from_frame, m, by name, for recorded topics."""
+    def __init__(
+        self,
+        sensors: Sequence[Sensor],
+        frames: dict[str, F64Array],
+        offset_ns: Callable[[Topic], int | None],
+    ) -> None:
+        """frames: (4, 4) body_from_frame, m, by name, for recorded topics.
+
+        offset_ns: once there are columns, scan clock minus receive time, by which messages of a
+        topic are forwarded or dropped; None: all are dropped.
+        """
         self.name = IMU
         self.line = PoseLine(_NO_POSES)
         self._sensors = sensors
@@ -95,6 +113,8 @@ class ImuPoses:
         # Samples that wait, by the number of their sensor or the name of their topic.
         self._waiting: dict[int | str, list[_Samples]] = {}
         self._frame_of: dict[str, str] = {}
+        self._topics: dict[str, Topic] = {}
+        self._topic_offset_ns = offset_ns
         self._chosen: int | str | None = None
         self._integrator: Integrator | None = None
         self._newest_ns: int | None = None
@@ -112,11 +132,20 @@ class ImuPoses:
         """After a gap of the IMU."""
         return self._integrator is not None and self._integrator.is_lost
 
+    @property
+    def ended(self) -> str:
+        """The gap."""
+        if self._integrator is None or not self._integrator.is_lost:
+            return ""
+        return f"none after a gap of its samples of {self._integrator.gap_ns / NS_PER_MS:.0f} ms"
+
     def add(self, imu: Iterable[ImuSamples], messages: Iterable[Message]) -> None:
         """Keep the samples of a batch."""
         for samples in imu:
             offset_ns = self._sensors[samples.sensor].clock.imu_offset_ns
-            one = (samples.stamp_ns + offset_ns, samples.acceleration, samples.angular_velocity)
+            stamp_ns = samples.stamp_ns + offset_ns
+            near = np.zeros(len(stamp_ns), np.int64)
+            one = (stamp_ns, samples.acceleration, samples.angular_velocity, near)
             self._keep(samples.sensor, one)
         for message in messages:
             if message.topic.type == IMU_TYPE:
@@ -124,6 +153,7 @@ class ImuPoses:
                 if found is not None:
                     frame, sample = found
                     self._frame_of.setdefault(message.topic.name, frame)
+                    self._topics.setdefault(message.topic.name, message.topic)
                     self._keep(message.topic.name, sample)
 
     def _keep(self, key: int | str, samples: _Samples) -> None:
@@ -137,7 +167,14 @@ class ImuPoses:
         parts = self._waiting.pop(self._chosen, []) if self._chosen is not None else []
         if not parts or self._integrator is None:
             return
-        stamp_ns, force, rate = (np.concatenate(part) for part in zip(*parts, strict=True))
+        stamp_ns, force, rate, ahead_ns = (
+            np.concatenate(part) for part in zip(*parts, strict=True)
+        )
+        if isinstance(self._chosen, str):
+            near = self._near(self._topics[self._chosen], ahead_ns)
+            stamp_ns, force, rate = stamp_ns[near], force[near], rate[near]
+            if not len(stamp_ns):
+                return
         # Repeated samples, and those that were received after later ones, add nothing.
         newest = np.maximum.accumulate(stamp_ns)
         before = np.concatenate([[self._newest_ns or -1], newest[:-1]])
@@ -150,6 +187,27 @@ class ImuPoses:
         self.gyro_bias = self._integrator.gyro_bias
         if len(track.stamp_ns):
             self.line.extend(track, oldest_ns - _KEPT_NS)
+
+    def _near(self, topic: Topic, ahead_ns: I64Array) -> BoolArray:
+        """Which samples (n,) are on the clock of the scans; ClockError if the first is not.
+
+        ahead_ns: their time minus that of their message. The others are not forwarded, either.
+        """
+        offset_ns = self._topic_offset_ns(topic)
+        remedy = "set IMU and lidars to one time source, or give a trajectory (--deskew FILE.tum)"
+        if offset_ns is None:
+            raise ClockError(
+                f"--deskew imu: {topic.name}: expected scans on the clock of its header, found "
+                f"scans on no epoch clock (UTC, TAI); {remedy}"
+            )
+        near: BoolArray = np.abs(ahead_ns - offset_ns) <= NEAR_NS
+        if self._newest_ns is None and not near[0]:
+            raise ClockError(
+                f"--deskew imu: {topic.name}: expected the clock of its header and that of the "
+                "scans within 1 s of each other, found the scans "
+                f"{format_difference(offset_ns - int(ahead_ns[0]))} from it; {remedy}"
+            )
+        return near
 
     def _choose(self) -> bool:
         """Choose the IMU; False while there are no samples."""
@@ -186,8 +244,9 @@ class ImuPoses:
         return True
 
 
-# Stamps (n,), specific force (n, 3) in m/s2, angular velocity (n, 3) in rad/s.
-_Samples = tuple[I64Array, F64Array, F64Array]
+# Stamps (n,), specific force (n, 3) in m/s2, angular velocity (n, 3) in rad/s, stamps minus times
+# of messages (n,).
+_Samples = tuple[I64Array, F64Array, F64Array, I64Array]
 _NO_POSES = PoseTrack(np.zeros(0, np.int64), np.zeros((0, 3, 3)), np.zeros((0, 3)))
 
 
@@ -206,19 +265,31 @@ def _sample_of(message: Message) -> tuple[str, _Samples] | None:
     rate, force = values[13:16], values[25:28]
     if not np.isfinite(values[13:28]).all() or stamp_ns <= 0:
         return None
-    return frame, (np.array([stamp_ns]), force[None], rate[None])
+    ahead_ns = np.array([stamp_ns - message.host_ns])
+    return frame, (np.array([stamp_ns]), force[None], rate[None], ahead_ns)
 
 
 class Deskew:
     """Takes windows, yields them with the transforms of their columns."""
 
-    def __init__(self, source: PoseSource, to: str, max_wait_ns: int | None, sensors: int) -> None:
-        """to: a word of INSTANTS; max_wait_ns: how long windows wait for poses; None: for ever."""
+    def __init__(
+        self,
+        source: PoseSource,
+        to: str,
+        max_wait_ns: int | None,
+        points: WindowPoints,
+        sensors: int,
+    ) -> None:
+        """to: a word of INSTANTS; max_wait_ns: how long windows wait for poses; None: for ever.
+
+        points: what reads the points of windows, for the check.
+        """
         self.source = source
         self._to = to
         self._max_wait_ns = None if max_wait_ns is None else max(max_wait_ns, _LEAST_WAIT_NS)
         self._waiting: deque[Window] = deque()
         self._counts = MotionLedger(source.name, to)
+        self._check = RotationCheck(points)
         # Columns of each sensor in windows that were left out.
         self.dropped = [0] * sensors
 
@@ -244,6 +315,7 @@ class Deskew:
             self.source.advance(self._waiting[0].start_ns)
         while self._waiting:
             yield from self._moved(self._waiting.popleft())
+        self._check.finish(self.source.name)
 
     def awaits(self, newest_ns: int) -> bool:
         """Whether windows wait for poses that may come; newest_ns: newest stamp of all sensors."""
@@ -265,6 +337,8 @@ class Deskew:
             source=self.source.name,
             poses=self.source.line.poses,
             gyro_bias=self.source.gyro_bias,
+            ended=self.source.ended,
+            rotation=self._check.outcome,
         )
 
     def _is_due(self, newest_end_ns: int) -> bool:
@@ -289,6 +363,7 @@ class Deskew:
             for sensor, figures in enumerate(window.figures):
                 self.dropped[sensor] += figures.columns
             return
+        self._check.add(window, line, self.source.name, is_last=self.source.is_complete)
         counts.moved += len(columns)
         moves = line.moves(columns.stamp_ns, to_ns)
         yield replace(window, columns=replace(columns, moves=moves))

@@ -336,10 +336,10 @@ class MessageQueue:
         for recording in recordings:
             for topic in recording.topics:
                 is_written = topic.encoding in self._encodings and topic.name != OWN_TOPIC
-                if is_written and topic.type != IMU_TYPE and self._is_asked_for(topic):
+                if is_written and topic.type != IMU_TYPE and self.is_asked_for(topic):
                     raise _other_clock(topic, "the capture host's clock", scan_offset_ns, remedies)
 
-    def _is_asked_for(self, topic: Topic) -> bool:
+    def is_asked_for(self, topic: Topic) -> bool:
         """True if `--pass` names the topic."""
         return any(fnmatchcase(topic.name, pattern) for pattern in self._patterns)
 
@@ -451,7 +451,7 @@ class MessageQueue:
         ClockError if `--pass` names the topic and not even its first message is near.
         """
         ahead_ns = stamp_ns - message.host_ns
-        if not self._is_asked_for(message.topic):
+        if not self.is_asked_for(message.topic):
             return clock_offset_ns is not None and abs(ahead_ns - clock_offset_ns) <= NEAR_NS
         apart_ns = self._scan_offset_ns - ahead_ns
         if abs(apart_ns) <= NEAR_NS:

@@ -196,12 +196,13 @@ def _motion_notes(run: Conversion) -> Iterator[Note]:
         return
     motion = run.deskew.ledger
     if motion.windows_without_poses:
+        ended = f" ({motion.ended})" if motion.ended else ""
         yield Note(
             "no_pose",
             "",
             f"{motion.source} has no poses of {motion.windows_without_poses} windows with "
-            f"{motion.no_pose} of {motion.columns} columns, which were left out; give a trajectory "
-            "of the whole recording",
+            f"{motion.no_pose} of {motion.columns} columns{ended}, which were left out; give a "
+            "trajectory of the whole recording",
         )
     velocity = motion.velocity
     # Nothing is known before the first two windows.

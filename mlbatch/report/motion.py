@@ -8,7 +8,51 @@ from dataclasses import dataclass, field
 # Numbers of windows that the report names.
 _MOST_NAMED = 100
 
-Json = str | int | list[int] | list[float] | dict[str, int] | dict[str, float]
+Json = (
+    str
+    | int
+    | list[int]
+    | list[float]
+    | dict[str, int]
+    | dict[str, float]
+    | dict[str, str | int | float]
+)
+
+
+@dataclass(slots=True)
+class RotationFigures:
+    """Of poses: how their rotation fits that of the points; windows: that were compared.
+
+    not_checked: why nothing is known, or ""; scale: rotation of the poses by that of the points;
+    turned_deg: between their axes; delay_ms: how late the poses are; known_ms: its standard
+    deviation.
+    """
+
+    windows: int = 0
+    not_checked: str = ""
+    scale: float = 1.0
+    turned_deg: float = 0.0
+    delay_ms: float = 0.0
+    known_ms: float = 0.0
+
+    def as_json(self) -> dict[str, str | int | float]:
+        """The section of the report."""
+        if self.not_checked:
+            return {"outcome": "not checked", "reason": self.not_checked, "windows": self.windows}
+        return {
+            "outcome": "agrees",
+            "windows": self.windows,
+            "scale": round(self.scale, 4),
+            "turned_deg": round(self.turned_deg, 2),
+            "delay_ms": self.delay_ms,
+            "delay_deviation_ms": round(self.known_ms, 2),
+        }
+
+    def describe(self) -> str:
+        """A part of a line of the summary."""
+        if self.not_checked:
+            return f"rotation not checked ({self.not_checked})"
+        return f"rotation as that of the points in {self.windows} windows"
 
 
 @dataclass(slots=True)
@@ -53,7 +97,8 @@ class MotionLedger:
     """What was moved; source: of the poses; to: instant of the window, as `--deskew-to`.
 
     poses: how many were used; windows_without_poses: left out, with `no_pose` columns; gyro_bias:
-    rad/s, of IMU poses; velocity: of velocities instead of poses.
+    rad/s, of IMU poses; ended: why there are no later poses; rotation: against that of the points;
+    velocity: of velocities instead of poses.
     """
 
     source: str
@@ -64,6 +109,8 @@ class MotionLedger:
     no_pose: int = 0
     windows_without_poses: int = 0
     gyro_bias: tuple[float, ...] = field(default=())
+    ended: str = ""
+    rotation: RotationFigures | None = None
     velocity: VelocityCounts | None = None
 
     def as_json(self) -> dict[str, Json]:
@@ -79,6 +126,8 @@ class MotionLedger:
         }
         if self.gyro_bias:
             found["gyro_bias_rad_s"] = list(self.gyro_bias)
+        if self.rotation is not None:
+            found["rotation_check"] = self.rotation.as_json()
         if self.velocity is not None:
             found.update(self.velocity.as_json())
         return found
@@ -92,6 +141,8 @@ class MotionLedger:
         )
         if self.windows_without_poses:
             text += f"; {self.windows_without_poses} windows without poses left out"
+        if self.rotation is not None:
+            text += f"; {self.rotation.describe()}"
         return text
 
     def _describe_velocity(self, velocity: VelocityCounts) -> str:
