@@ -32,18 +32,23 @@ _MOST_TURN_ACCELERATION = 20.0
 # The first two windows are moved by the velocity between them, until it changes by less than this.
 _SETTLED = 0.05
 _MOST_ROUNDS = 15
+# A window is moved if that removes this share of the cost: at rest, and where the motion changes
+# within a window, it does not.
+_LEAST_GAIN = 0.01
 
 # Why a window has no velocity; words of the report.
 FIRST = "first"
 JUMP = "jump"
-REASONS = (FIRST, "few_points", "degenerate", "no_convergence", "residual", JUMP)
+NO_GAIN = "no_gain"
+REASONS = (FIRST, NO_GAIN, "few_points", "degenerate", "no_convergence", "residual", JUMP)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Estimate:
-    """Motion of a window; velocity: (6,), twist a second, m/s and rad/s; None for a reason.
+    """Motion of a window; velocity: (6,), twist a second, m/s and rad/s; None where it is unknown.
 
-    residual_m: of a window that was registered, else None.
+    reason: why its points are not to be moved, or ""; residual_m: of a window that was registered,
+    else None.
     """
 
     velocity: F64Array | None = None
@@ -84,7 +89,8 @@ class VelocityEstimator:
         # Over a failed window the velocity is an older one.
         if gap_ns > 1.5 * period_ns:
             return Estimate(reason=FIRST, residual_m=found.residual_m)
-        return Estimate(found.velocity, residual_m=found.residual_m)
+        reason = NO_GAIN if found.gain < _LEAST_GAIN else ""
+        return Estimate(found.velocity, reason, found.residual_m)
 
     def _begin(self, cloud: Cloud, middle_ns: int, reason: str) -> Estimate:
         self._first = cloud

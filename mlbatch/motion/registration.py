@@ -89,13 +89,15 @@ class Registration:
     """Outcome of a registration.
 
     pose: map_from_body at the middle of the window; velocity: (6,), twist a second; residual_m:
-    median distance of matched points across planes and stems; failure: why the result cannot be
-    used, a word of the report, or an empty text.
+    median distance of matched points across planes and stems; gain: share of the cost of all points
+    that is gone since they were moved; failure: why the result cannot be used, a word of the
+    report, or an empty text.
     """
 
     pose: Pose
     velocity: F64Array
     residual_m: float = 0.0
+    gain: float = 0.0
     failure: str = ""
 
 
@@ -123,6 +125,12 @@ class _Matches:
         rows = (jacobian * root[:, None, None]).reshape(-1, 6)
         values = (self._residual * root[:, None]).reshape(-1)
         return np.matmul(rows.T, rows), np.matmul(rows.T, values)
+
+    def cost(self, points: int) -> float:
+        """Sum of the kernel over all points; of a point in no voxel the most that it can be."""
+        square = (self._residual**2).sum(axis=1)
+        within = float((_KERNEL * square / (_KERNEL + square)).sum())
+        return within + _KERNEL * (points - self.count)
 
     @property
     def residual_m(self) -> float:
@@ -156,8 +164,11 @@ def register(
             failure = "degenerate" if _is_degenerate(normal) else ""
             if not failure and matches.residual_m > _MOST_RESIDUAL_M:
                 failure = "residual"
+            unmoved = _Matches(distributions, cloud.points_m, pose)
+            count = len(cloud.points_m)
+            gain = 1.0 - matches.cost(count) / max(unmoved.cost(count), 1e-12)
             return Registration(
-                before.then(velocity * gap_s), velocity, matches.residual_m, failure
+                before.then(velocity * gap_s), velocity, matches.residual_m, gain, failure
             )
     return Registration(pose, velocity, failure="no_convergence")
 

@@ -153,7 +153,7 @@ class ConstantVelocity:
         middle_ns = (start_ns + end_ns) // 2
         estimate = self._estimator.add(cloud, middle_ns, end_ns - start_ns)
         self._count(estimate, slices)
-        if estimate.velocity is None:
+        if estimate.velocity is None or estimate.reason:
             yield from slices
             return
         line = _line(estimate.velocity, start_ns, end_ns)
@@ -173,7 +173,7 @@ class ConstantVelocity:
         if estimate.residual_m is not None:
             counts.poses += 1
             velocity.residual_m.append(estimate.residual_m)
-        if estimate.velocity is not None:
+        if not estimate.reason:
             counts.moved += columns
             return
         velocity.unmoved += columns

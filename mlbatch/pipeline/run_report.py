@@ -205,8 +205,9 @@ def _motion_notes(run: Conversion) -> Iterator[Note]:
             "trajectory of the whole recording",
         )
     velocity = motion.velocity
-    # Nothing is known before the first two windows.
-    if velocity is not None and sum(velocity.windows.values()) > velocity.windows.get("first", 0):
+    # Nothing is known before the first two windows, and nothing is missed at rest.
+    expected = ("first", "no_gain")
+    if velocity is not None and not set(velocity.windows) <= set(expected):
         yield Note(
             "no_velocity",
             "",

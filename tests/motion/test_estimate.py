@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from mlbatch.arrays import F64Array
-from mlbatch.motion.estimate import FIRST, Estimate, VelocityEstimator
+from mlbatch.motion.estimate import FIRST, NO_GAIN, Estimate, VelocityEstimator
 from mlbatch.motion.registration import Cloud
 
 PERIOD_NS = 100_000_000
@@ -86,7 +86,9 @@ def estimates(
 def test_a_constant_motion_is_found_from_the_third_window_on(speed: float, turn: float) -> None:
     """Also if it does not begin at rest: v along x, turn around z, nothing else."""
     found = estimates(ROOM, list(range(10)), speed, turn)
-    assert [one.reason for one in found] == [FIRST, FIRST, *[""] * 8]
+    # What stands is not moved.
+    reason = "" if speed else NO_GAIN
+    assert [one.reason for one in found] == [FIRST, FIRST, *[reason] * 8]
     for one in found[2:]:
         assert one.velocity is not None
         np.testing.assert_allclose(one.velocity[:3], [speed, 0, 0], atol=0.05)
@@ -136,7 +138,7 @@ def test_after_a_gap_everything_begins_again() -> None:
 def test_an_impossible_change_is_refused() -> None:
     """From rest to 12 m/s between two windows: 120 m/s2."""
     found = estimates(ROOM, list(range(6)), 12.0, 0.0, begin=4)
-    assert [one.reason for one in found[:4]] == [FIRST, FIRST, "", ""]
+    assert [one.reason for one in found[:4]] == [FIRST, FIRST, NO_GAIN, NO_GAIN]
     assert found[5].velocity is None
 
 
