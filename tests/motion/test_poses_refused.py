@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -78,7 +79,7 @@ def changed(drive: Recorded, change: Change) -> str:
                 head = np.array([stamp_ns // S, stamp_ns % S], "<u4").tobytes()
                 data = data[:4] + head + data[12:-TAIL] + values.astype("<f8").tobytes()
             writer.add_message(channels[channel.id], message.log_time, data, message.publish_time)
-        writer.finish()
+        cast(Any, writer).finish()
     return f"convert drive.mcap --rig {drive.rig}"
 
 
