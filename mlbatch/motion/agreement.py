@@ -163,18 +163,18 @@ def _fits(turns: Turns, begin_ns: I64Array, end_ns: I64Array, seen: F64Array) ->
     """The best scale, axes and delay, and all together."""
     steps = _FARTHEST_NS // _STEP_NS
     delays_ns = np.arange(-steps, steps + 1) * _STEP_NS
-    told = turns.between(begin_ns + delays_ns[:, None], end_ns + delays_ns[:, None])
-    energy = np.maximum((told**2).sum(axis=(1, 2)), 1e-12)
+    reported_turns = turns.between(begin_ns + delays_ns[:, None], end_ns + delays_ns[:, None])
+    energy = np.maximum((reported_turns**2).sum(axis=(1, 2)), 1e-12)
     # Orthogonal Procrustes: the axes that fit best, of either hand.
-    left, stretch, right = np.linalg.svd(np.matmul(seen.T, told))
-    turned = np.matmul(told, np.matmul(left, right).transpose(0, 2, 1))
+    left, stretch, right = np.linalg.svd(np.matmul(seen.T, reported_turns))
+    turned = np.matmul(reported_turns, np.matmul(left, right).transpose(0, 2, 1))
     # Of the angle by which the rotations themselves are turned, not axes that show none.
-    cosine = (turned * told).sum(axis=(1, 2)) / energy
+    cosine = (turned * reported_turns).sum(axis=(1, 2)) / energy
     turned_deg = np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))
     share = stretch.sum(axis=1) / energy
-    late = _trimmed(seen - told)
+    late = _trimmed(seen - reported_turns)
     whole = _trimmed(seen - share[:, None, None] * turned)
-    own = told[steps]
+    own = reported_turns[steps]
     shown = max(float((own * seen).sum() / energy[steps]), 1e-6)
     at, all_at = int(late.argmin()), int(whole.argmin())
     return [
