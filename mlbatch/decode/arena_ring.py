@@ -101,11 +101,6 @@ class ArenaRing:
         """See `PacketRing`."""
         return int(self._sums[np.searchsorted(self._places, ring_index, side="right") - 1])
 
-    def gather(self, ring_index: I64Array, out: U8Array) -> None:
-        """See `PacketRing`."""
-        pieces, origin = self.view
-        out.view(pieces.dtype)[:, 0] = pieces[(ring_index - origin) % len(pieces), 0]
-
     def _copied(self, data: U8Array, start: I64Array) -> tuple[U8Array, int, I64Array]:
         """Copy packets to the arena; return the region, its place, and where they begin there."""
         region, place = self._arena.reserve(len(start) * self._size)

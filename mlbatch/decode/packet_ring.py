@@ -26,10 +26,9 @@ class PacketRing:
     """Ring buffer of whole packets, read column by column.
 
     A packet takes a whole number of rows of `Records.stride` bytes: row r of the packet in slot p
-    begins at byte `(p * rows + r) * stride + start`. A packet is copied once; columns are gathered
-    by one indexed copy of rows or parts of rows. Every column has a ring index, an int64 that
-    counts up and is never reused; the buffer contains the newest. One thread may `store` while
-    others `gather` ring_indexes that are still needed.
+    begins at byte `(p * rows + r) * stride + start`. A packet is copied once. Every column has a
+    ring index, an int64 that counts up and is never reused; the buffer contains the newest. One
+    thread may `store` while others read a `view` at ring indexes that are still needed.
     """
 
     def __init__(self, packet_size: int, records: Records) -> None:
@@ -37,7 +36,6 @@ class PacketRing:
         self._records = records
         self._rows_per_packet = -(-packet_size // records.stride)
         self._places = self._rows_per_packet * records.per_row
-        self._is_plain = records.per_row == 1 and records.size == records.stride
         self._next = 0
         self._capacity = 0
         # Of all packets, and up to the packet in each slot; only where they are asked for.
@@ -129,22 +127,6 @@ class PacketRing:
         """
         return int(self._sums[ring_index // self._places % self._capacity])
 
-    def gather(self, ring_index: I64Array, out: U8Array) -> None:
-        """Copy the columns at `ring_index` (n,) to the rows of `out` (n, records.size)."""
-        # Each view is read once: another thread may replace it by a larger one.
-        if self._is_plain:
-            rows = self._rows
-            rows.take(ring_index % len(rows), axis=0, out=out, mode="clip")
-            return
-        count, windows = self._windows
-        # numpy divides by a scalar much faster than it takes the remainder.
-        per_row = self._records.per_row
-        row = ring_index // per_row
-        at = (ring_index - row * per_row) * self._records.step
-        row -= row // count * count
-        at += row * self._records.stride
-        out.view(windows.dtype)[:, 0] = windows[at]
-
     def _allocate(self, packets: int) -> U8Array:
         """Return a buffer for so many packets, all zero."""
         rows = packets * self._rows_per_packet
@@ -159,26 +141,14 @@ class PacketRing:
         self._capacity = packets
         records = self._records
         rows = packets * self._rows_per_packet
-        begin = records.start
-        end = begin + rows * records.stride
-        self._rows = self._bytes[begin:end].reshape(rows, -1)
         # Elements of a void type may overlap and are still copied as a whole.
         self._pieces: npt.NDArray[np.void] = np.ndarray(
             (rows, records.per_row),
             np.dtype((np.void, records.size)),
             buffer=self._bytes.data,
-            offset=begin,
+            offset=records.start,
             strides=(records.stride, records.step),
         )
-        # The same for a column at any byte, so that one index is enough.
-        windows: npt.NDArray[np.void] = np.ndarray(
-            ((rows - 1) * records.stride + (records.per_row - 1) * records.step + 1,),
-            self._pieces.dtype,
-            buffer=self._bytes.data,
-            offset=begin,
-            strides=(1,),
-        )
-        self._windows = rows, windows
 
     def _reserve(self, count: int, oldest: int) -> int:
         """Return the first of `count` contiguous slots; slots before `oldest` may be reused."""
@@ -204,7 +174,7 @@ class PacketRing:
         sums = np.zeros(larger, np.uint64)
         sums[live % larger] = self._sums[live % capacity]
         self._sums = sums
-        # Last, since other threads gather columns meanwhile.
+        # Last, since other threads read columns meanwhile.
         self._use(new, larger)
 
 

@@ -3,19 +3,14 @@
 from __future__ import annotations
 
 import math
-from typing import TypeAlias
 
 import numpy as np
-import numpy.typing as npt
 
-from mlbatch.arrays import I64Array
 from mlbatch.types import PACKED_ROOM, PackedPoints, RecordLayout
 
 # All of a point but its readings, in one word of 8 bytes that is copied as one. The time, in ns
 # after the start of the scan, is the low half, so that it can be added as a number.
 LABEL = np.dtype([("time_ns", "<u4"), ("ring", "<u2"), ("return_type", "u1"), ("lidar_id", "u1")])
-Labels: TypeAlias = npt.NDArray[np.void]
-_NAN = np.float32("nan")
 
 
 class ScanBuffer:
@@ -58,13 +53,6 @@ class ScanBuffer:
             return None
         end = PACKED_ROOM + math.prod(shape) * self.record.step
         return PackedPoints(self.packed, PACKED_ROOM, end, shape)
-
-    def clear(self, rows: I64Array) -> None:
-        """Empty all slots of some rows: NaN in float arrays, 0 in integer arrays."""
-        self.point[rows] = _NAN
-        self.range_m[rows] = _NAN
-        self.reflectivity[rows] = 0
-        self.label.view(np.uint64)[rows] = 0
 
 
 def by_time(points: ScanBuffer, count: int, out: ScanBuffer) -> None:

@@ -1,4 +1,4 @@
-"""Records at their places in the arena: what was stored is what is gathered, however it moves."""
+"""Records at their places in the arena: what was stored is what is read, however it moves."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from mlbatch.decode.packet_ring import PacketRing
 from mlbatch.lidar.interface import Records
 from mlbatch.native.arena import PacketArena
 from tests.builders.engines import needs_native
+from tests.reference.decoder import record_of
 
 pytestmark = needs_native
 
@@ -35,9 +36,7 @@ def _columns(packets: U8Array) -> U8Array:
 
 def _gathered(ring: ArenaRing, first: I64Array) -> U8Array:
     index = (first[:, None] + ring.column_offsets(COLUMNS)).reshape(-1)
-    out = np.zeros((len(index), 9), np.uint8)
-    ring.gather(index, out)
-    return out
+    return np.stack([record_of(ring, one) for one in index.tolist()])
 
 
 def _read(arena: PacketArena, packets: U8Array, gap: int) -> tuple[U8Array, I64Array, int]:

@@ -286,7 +286,7 @@ def test_terms_of_zero_keep_the_signs_of_zeros(
     first, second, third = beams.vectors()
     cosine, sine = (part[word, None, None] for part in beams.rotor())
     direction = cosine * first + sine * second + third
-    ranges_m = np.stack([readings_of(lidar, record_of(source, at), 0)[0] for at in places])
+    ranges_m = np.stack([readings_of(lidar, record_of(source.ring, at), 0)[0] for at in places])
     reaches_m = ranges_m + beams.reach_m.astype(np.float32)
     expected = (reaches_m[:, None] * direction + beams.origins()[word]).transpose(0, 2, 1)
     info = SensorInfo("one", lidar.model, lidar.channels, lidar.returns, 0, POSES[pose])

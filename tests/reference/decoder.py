@@ -17,6 +17,8 @@ from typing import TypeAlias
 import numpy as np
 
 from mlbatch.arrays import F64Array, I64Array, U8Array
+from mlbatch.decode.arena_ring import ArenaRing
+from mlbatch.decode.packet_ring import PacketRing
 from mlbatch.decode.source import Source
 from mlbatch.lidar.geometry import BeamTable
 from mlbatch.lidar.interface import Lidar
@@ -79,7 +81,7 @@ class LiteralDecoder:
         source = self.sources[int(columns.sensor[number])]
         lidar = source.lidar
         word = int(columns.encoder[number])
-        record = record_of(source, int(columns.ring_index[number]))
+        record = record_of(source.ring, int(columns.ring_index[number]))
         table = min(word >> 56, len(lidar.firing_ns) - 1)
         if lidar.beams.angle_rad is not None:
             table = 0
@@ -134,12 +136,12 @@ class LiteralDecoder:
         return inside, unsure
 
 
-def record_of(source: Source, ring_index: int) -> U8Array:
-    """Bytes of a column and those behind it that words of its last pixel may reach."""
-    view, origin = source.ring.view
+def record_of(ring: PacketRing | ArenaRing, ring_index: int) -> U8Array:
+    """Bytes of a column."""
+    view, origin = ring.view
     rows, per_row = view.shape
-    row = (ring_index // per_row - origin) % rows
-    record: U8Array = np.frombuffer(view[row, ring_index % per_row].tobytes(), np.uint8)
+    row, place = divmod(ring_index - origin, per_row)
+    record: U8Array = np.frombuffer(view[row % rows, place].tobytes(), np.uint8)
     return record
 
 
