@@ -151,7 +151,7 @@ class Conversion:
         """Warn where a sensor counts as silent between two of its messages."""
         for sensor in self.sensors:
             message_ns = sensor.message_ns(self.session.setup.sampler.table)
-            if message_ns + SLACK_NS > max_wait_ns:
+            if message_ns and message_ns + SLACK_NS > max_wait_ns:
                 length_s = message_ns / NS_PER_S
                 text = (
                     f"--max-wait {max_wait_ns / NS_PER_S:g}: expected more than a message of "

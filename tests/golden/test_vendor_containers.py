@@ -118,6 +118,9 @@ def test_a_message_that_is_longer_than_the_wait_is_warned_of(
     )
     warned = [one for one in in_memory(short).report.warnings if one.code == "max_wait"]
     assert [one.code for one in warned] == codes
+    # Single packets are no messages, however short the wait is.
+    shortest = in_memory(replace(short, max_wait_ns=10_000)).report.warnings
+    assert [one.code for one in shortest if one.code == "max_wait"] == codes
     for one in warned:
         found = re.fullmatch(
             r"--max-wait 0\.05: expected more than a message of \S+, which holds (0\.\d+) s .*"
