@@ -59,6 +59,9 @@ def split_at(messages: Sequence[Recorded], parts: int) -> list[list[Recorded]]:
     return [list(messages[a:b]) for a, b in itertools.pairwise(bounds)]
 
 
+_DATA_END = 15
+
+
 @dataclass(frozen=True, slots=True)
 class Mcap:
     """How an MCAP file is made; without a summary it ends at its last record, and then `tail`."""
@@ -93,10 +96,19 @@ def write_mcap(path: Path, messages: Iterable[Recorded], form: Mcap | None = Non
                 )
             at = message.log_ns
             writer.add_message(channels[message.topic], at, message.data, at)
-        end: Callable[[], None] = writer.finish if form.summary else writer.flush
+        end: Callable[[], None] = writer.finish
         end()
-        file.write(form.tail)
+    data = path.read_bytes()
+    path.write_bytes((data if form.summary else _without_end(data)) + form.tail)
     return path
+
+
+def _without_end(data: bytes) -> bytes:
+    """An MCAP file up to its record DataEnd, as a recorder that was killed leaves it."""
+    at = 8
+    while data[at] != _DATA_END:
+        at += 9 + int.from_bytes(data[at + 1 : at + 9], "little")
+    return data[:at]
 
 
 def _pcapng(folder: Path) -> Path:
