@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+import signal
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -14,6 +15,10 @@ from tests.builders.sessions import Shell
 # No deadline: how long an example takes depends on how loaded the machine is.
 settings.register_profile("mlbatch", deadline=None, suppress_health_check=[HealthCheck.too_slow])
 settings.load_profile("mlbatch")
+
+# In the background shells have SIGINT ignored, and so would the commands that tests interrupt.
+if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 # Whole suites of cases: folders, files and tests that take seconds. `make test-quick` leaves them
 # out; who works on their subject names them: `pytest tests/verify`.
