@@ -35,6 +35,7 @@ from mlbatch.report.limits import Limit, exceeded
 from mlbatch.report.report import RunReport, build_report, report_text
 from mlbatch.types import RunInfo
 from mlbatch.writers import (
+    SHARD_JSON,
     ScanWriter,
     WriterOptions,
     check_options,
@@ -124,7 +125,7 @@ def _run_one(job: Job, target: Target) -> list[str]:
         job = replace(job, record=record_layout(name, options))
         output = target.written
         preflight.check_output(job, output, name)
-        if target.resume and _is_complete(output, overwrite=target.overwrite):
+        if target.resume and _is_complete(job, output, target, name, options):
             return _beyond_limits_before(target, name)
         resume_log = _resume_log(job, output, name, options, resumes=target.resume)
         options = options._replace(kept_bytes=resume_log.kept_bytes, kept_crc=resume_log.kept_crc)
@@ -136,7 +137,7 @@ def _run_one(job: Job, target: Target) -> list[str]:
             from mlbatch.pipeline.shard_part import ShardOutput
 
             shard_output = ShardOutput(job.shard, name, options, resume_log)
-        open_output = _opener(name, output, options, shard_output)
+        open_output = _opener(name, output, options, resume_log, shard_output)
         if shard_output is None:
             report_path = report_path or report_paths(output, name).report
     preflight.check_report(job, report_path, target.written, name)
@@ -145,7 +146,11 @@ def _run_one(job: Job, target: Target) -> list[str]:
     shown = not target.quiet
     with progress_bar(*stages, is_shown=shown, is_verbose=target.verbose) as progress:
         conversion, inputs = _converted(
-            job, open_output, progress, resume_log, _last(target, report_path, shard_output)
+            job,
+            open_output,
+            progress,
+            resume_log,
+            _last(target, report_path, resume_log, shard_output),
         )
     inputs = inputs._replace(command=_command())
     for note in conversion.notes:
@@ -248,23 +253,33 @@ def _print_shard(output: ShardOutput, inputs: RunReport, target: Target) -> None
     )
 
 
-def _last(target: Target, report_path: Path | None, shard_output: ShardOutput | None) -> Last:
+def _last(
+    target: Target,
+    report_path: Path | None,
+    resume_log: ResumeLog | None,
+    shard_output: ShardOutput | None,
+) -> Last:
     """Writes what an output has in the end: the report, or the account of a shard."""
     if shard_output is None:
-        return _report_writer(target, report_path)
+        return _report_writer(target, report_path, resume_log)
     complete = shard_output.complete
     return lambda inputs, partial: complete(inputs._replace(command=_command()), partial)
 
 
-def _report_writer(target: Target, report_path: Path | None) -> Last:
+def _report_writer(target: Target, report_path: Path | None, resume_log: ResumeLog | None) -> Last:
     """Writes the report before the output has its name, so that no output is without one."""
 
     def write(inputs: RunReport, partial: Path) -> None:
-        if report_path is None or target.output is None:
+        if report_path is None or target.output is None or resume_log is None:
             return
+        from mlbatch.pipeline.job_identity import identity_of_parts
+
+        inputs = inputs._replace(
+            command=_command(), identity=identity_of_parts(resume_log.identity)
+        )
         is_inside = report_path.parent.absolute() == target.output.absolute()
         path = partial / report_path.name if is_inside else report_path
-        write_text(path, report_text(inputs._replace(command=_command())), target.fsync)
+        write_text(path, report_text(inputs), target.fsync)
         if target.fsync and path.parent.absolute() != target.output.parent.absolute():
             sync_entries(path.parent)
 
@@ -312,9 +327,16 @@ def _write_page(conversion: Conversion, inputs: RunReport, target: Target) -> No
 
 
 def _opener(
-    name: str, output: Path, options: WriterOptions, shard_output: ShardOutput | None
+    name: str,
+    output: Path,
+    options: WriterOptions,
+    resume_log: ResumeLog,
+    shard_output: ShardOutput | None,
 ) -> OpenWriter:
     def start(info: RunInfo) -> ScanWriter:
+        if options.kept_bytes is not None:
+            # Only now it is known that this is the job of the interrupted run.
+            say(f"{output}: resumed after {resume_log.done} scans")
         writer = open_writer(name, output, info, options)
         return writer if shard_output is None else shard_output.around(writer, info)
 
@@ -416,17 +438,42 @@ def _with_number(path: Path | None, number: int, *suffixes: str) -> Path | None:
 # -- interrupted runs -------------------------------------------------------------------------
 
 
-def _is_complete(output: Path, *, overwrite: bool) -> bool:
-    """True if an earlier run completed the output, so that there is nothing to resume."""
+def _is_complete(job: Job, output: Path, target: Target, name: str, options: WriterOptions) -> bool:
+    """True if an earlier run of this job completed the output: there is nothing to resume.
+
+    UsageError if another job made the output; name: of the format.
+    """
     from mlbatch.pipeline import resume
 
     earlier = resume.find(output)
     # With --overwrite an older output is replaced, but not the one of the interrupted run.
-    if not earlier.is_complete or (overwrite and not earlier.was_published):
+    if not earlier.is_complete or (target.overwrite and not earlier.was_published):
         return False
+    changed = _difference_of_output(job, output, target, name, options)
+    if changed and target.overwrite:
+        return False
+    if changed:
+        raise UsageError(
+            f"{output}: expected the complete output of this job for --resume, found {changed}; "
+            "choose another output, or replace this one with --overwrite"
+        )
     resume.forget(output)
     say(f"{output}: is complete; there is nothing to resume")
     return True
+
+
+def _difference_of_output(
+    job: Job, output: Path, target: Target, name: str, options: WriterOptions
+) -> str:
+    """First difference between a job and the one that made an output, "" if there is none.
+
+    Outputs that do not say which job made them have none.
+    """
+    from mlbatch.pipeline.job_identity import difference_of_outputs, identity_of, read_identity
+
+    report = target.report or report_paths(output, name).report
+    identity = read_identity(report if job.shard is None else output / SHARD_JSON)
+    return difference_of_outputs(identity, identity_of(job, name, options)) if identity else ""
 
 
 def _resume_log(
@@ -449,6 +496,4 @@ def _resume_log(
         resume.forget(output)
         if resumes:
             say(f"{output}: nothing to resume; started over")
-    else:
-        say(f"{output}: resumed after {log.done} scans")
     return log

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 import mlbatch
-from mlbatch.bounded import open_file, read_bytes
+from mlbatch.bounded import open_file, parse_json, read_bytes, read_text
 from mlbatch.errors import RecordingError
 from mlbatch.pipeline.job import Job
 from mlbatch.writers import WriterOptions
@@ -50,6 +50,8 @@ _CALIBRATED = (
     "timestamp_mode",
 )
 _DIGITS = 12
+# A complete output of another version stays one.
+_VERSIONS = frozenset({"mlbatch", "numpy"})
 # In `_size_and_time`.
 _TIME_OF_CHANGE = re.compile(r", changed at -?\d+ ns")
 
@@ -96,11 +98,38 @@ def input_identity(run: Conversion) -> dict[str, str]:
 
 
 def identity_of_parts(identity: Mapping[str, str]) -> dict[str, str]:
-    """What the identities of all shards of a conversion share.
+    """What the identities of all shards of a conversion share, and the report of an output keeps.
 
     Recordings may be copies, which have other times.
     """
     return {key: _TIME_OF_CHANGE.sub("", text) for key, text in identity.items() if key != "shard"}
+
+
+def identity_of(job: Job, name: str, options: WriterOptions) -> dict[str, str]:
+    """Identity of the output that a job would make; reads the first seconds of its recordings."""
+    from mlbatch.pipeline.conversion import Conversion
+
+    return identity_of_parts(job_identity(job, name, options) | input_identity(Conversion(job)))
+
+
+def read_identity(path: Path) -> dict[str, str]:
+    """Identity in the report or shard.json of an output; empty where it has none."""
+    try:
+        content = parse_json(read_text(path))
+    except (OSError, ValueError):
+        return {}
+    identity = content.get("identity") if isinstance(content, dict) else None
+    if not isinstance(identity, dict):
+        return {}
+    return {str(key): str(text) for key, text in identity.items()}
+
+
+def difference_of_outputs(old: Mapping[str, str], new: Mapping[str, str]) -> str:
+    """As `difference`, whichever versions made the outputs."""
+    first, second = (
+        {key: text for key, text in one.items() if key not in _VERSIONS} for one in (old, new)
+    )
+    return difference(first, second)
 
 
 def difference(old: Mapping[str, str], new: Mapping[str, str]) -> str:

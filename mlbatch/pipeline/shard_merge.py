@@ -324,6 +324,7 @@ def _merged_report(parts: Sequence[Part], table: ScanTable, command: str) -> Run
         warnings=warnings,
         timing=None,
         command=" && ".join([*commands, command]),
+        identity=account.identity,
     )
 
 

@@ -9,6 +9,7 @@ from pathlib import Path
 
 from mlbatch.pipeline import preflight, resume
 from mlbatch.pipeline.job import Job, check_max_bag_s
+from mlbatch.pipeline.job_identity import identity_of_parts
 from mlbatch.pipeline.resume import ResumeLog
 from mlbatch.pipeline.run import convert
 from mlbatch.python.options import OutputOptions, choice, names_of, path_of
@@ -158,6 +159,7 @@ def run_job(job: Job, output: Path | None, options: OutputOptions) -> Run:
 
     def write_report(content: RunReport, partial: Path) -> None:
         path = partial / report_path.name if is_inside else report_path
+        content = content._replace(identity=identity_of_parts(log.identity))
         write_text(path, report_text(content), writer_options.fsync)
         if writer_options.fsync and path.parent.absolute() != output.parent.absolute():
             sync_entries(path.parent)

@@ -32,6 +32,10 @@ Section: TypeAlias = dict[str, Json]
 SCHEMA = "mlbatch.report/1"
 
 
+# What differs from machine to machine.
+_OF_MACHINE = ("timing", "command", "identity")
+
+
 class InputReport(NamedTuple):
     """One recording."""
 
@@ -141,6 +145,7 @@ class RunReport(NamedTuple):
     variants: tuple[tuple[str, str], ...] = ()  # as `RunInfo.variants`
     deskew: MotionLedger | None = None  # with --deskew
     command: str = ""  # command line; "" for runs by the Python interface
+    identity: dict[str, str] | None = None  # of the job, see `identity_of_parts`
 
 
 def build_report(run: RunReport) -> Section:
@@ -149,6 +154,7 @@ def build_report(run: RunReport) -> Section:
         "schema": SCHEMA,
         "version": mlbatch.__version__,
         **({"command": run.command} if run.command else {}),
+        **({"identity": run.identity} if run.identity else {}),
         "inputs": [item._asdict() for item in run.inputs],
         "timescale": run.timescale,
         "grid": {
@@ -177,8 +183,8 @@ def build_report(run: RunReport) -> Section:
 
 
 def without_machine(report: Section, inputs: Sequence[InputReport]) -> Section:
-    """The report without timings, paths and command: what depends on the recordings alone."""
-    kept = {key: value for key, value in report.items() if key not in ("timing", "command")}
+    """The report without timings, paths, command and identity."""
+    kept = {key: value for key, value in report.items() if key not in _OF_MACHINE}
     kept["inputs"] = [{"bytes": item.bytes, "container": item.container} for item in inputs]
     return kept
 

@@ -43,7 +43,7 @@ _OUTCOMES = ("no_return", "range", "box", "repeated", "written")
 _UNDERFILLED = 0.5
 _UNWRITTEN = ("empty", "dropped_incomplete")
 # Sections that differ between runs on the same recording.
-_MACHINE = ("timing", "inputs", "command")
+_MACHINE = ("timing", "inputs", "command", "identity")
 
 Json: TypeAlias = "dict[str, Json] | list[Json] | str | int | float | bool | None"
 Keys: TypeAlias = "tuple[str | int, ...]"

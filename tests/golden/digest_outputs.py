@@ -37,7 +37,7 @@ _MAGIC_BYTES = 8
 _REPORT = "mlbatch.report"
 _READY = "ready_host_ns"
 # Times of this run, sizes of containers that other libraries write.
-_LEFT_OUT = {"timing", "command"}
+_LEFT_OUT = {"timing", "command", "identity"}
 
 
 @dataclass(slots=True)

@@ -17,6 +17,7 @@ from typing import Any
 
 import pytest
 
+import mlbatch
 from mlbatch.cli import run
 from mlbatch.errors import ExportError, RecordingError
 from mlbatch.pipeline import job_identity, resume, state_file, workers
@@ -257,13 +258,58 @@ def test_another_job_is_refused(shell: Shell, words: str, difference: str) -> No
     _interrupt(shell)
     outcome = shell(f"convert {words} -o out --resume")
     assert outcome.code == 2
-    line = outcome.err.splitlines()[-1]
+    # Nothing is said to be resumed before that.
+    [line] = outcome.err.splitlines()
     assert line.startswith(
         f"mlbatch: error: out.partial: expected the job of the interrupted run, found {difference}"
     )
     assert line.endswith("; give the same, or leave out --resume to start over")
     # The right job can still be resumed.
     assert shell(f"convert {CAPTURE} -o out --resume").err.count("resumed after 3 scans") == 1
+
+
+@pytest.mark.parametrize(
+    ("first", "second", "difference"),
+    [
+        (CAPTURE, f"{CAPTURE} --rate 20", "rate '20' instead of 'not given'"),
+        (CAPTURE, f"{CAPTURE} --rig moved.yaml", "rig '"),
+        ("in/drive.pcap", "other/drive.pcap", "recording 1 'drive.pcap ("),
+    ],
+)
+@pytest.mark.parametrize("output", ["-o out", "-o out.mcap", "-o out --report elsewhere.json"])
+def test_a_complete_output_of_another_job_is_refused(
+    shell: Shell, first: str, second: str, difference: str, output: str
+) -> None:
+    rig = (FIXTURE / "rig.yaml").read_text().replace(": left.json", f": {FIXTURE}/left.json")
+    rig = rig.replace(": right.json", f": {FIXTURE}/right.json")
+    Path("moved.yaml").write_text(rig.replace("translation_m: [0.3,", "translation_m: [0.4,"))
+    write_session(Path("in"), Unit(turns=8))
+    write_session(Path("other"), Unit(turns=8, range_mm=5000))
+    assert shell(f"convert {first} {output}").code == 0
+    before = contents(Path())
+    name = output.split()[1]
+    refused = shell(f"convert {second} {output} --resume")
+    assert refused.code == 2
+    assert refused.err.startswith(
+        f"mlbatch: error: {name}: expected the complete output of this job for --resume, found "
+        f"{difference}"
+    )
+    assert refused.err.endswith("; choose another output, or replace this one with --overwrite\n")
+    assert contents(Path()) == before
+    assert "is complete" in shell(f"convert {first} {output} --resume").err
+    assert shell(f"convert {second} {output} --resume --overwrite").err == (
+        f"mlbatch: {name}: nothing to resume; started over\n"
+    )
+
+
+def test_copies_and_other_versions_make_the_same_output(
+    shell: Shell, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    capture = write_session(tmp_path / "in", Unit(turns=8))
+    assert shell(f"convert {capture} -o out").code == 0
+    os.utime(capture, ns=(1, 1))
+    monkeypatch.setattr(mlbatch, "__version__", "0.0.1")
+    assert "is complete" in shell(f"convert {capture} -o out --resume").err
 
 
 def test_another_recording_calibration_or_pose_is_refused(shell: Shell, tmp_path: Path) -> None:
