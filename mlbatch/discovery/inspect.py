@@ -34,7 +34,7 @@ from mlbatch.discovery.discover import (
 )
 from mlbatch.discovery.interleaved import shared_address
 from mlbatch.discovery.match import describe
-from mlbatch.discovery.overlap import iso
+from mlbatch.discovery.overlap import SharedLidars, iso
 from mlbatch.discovery.probe import first_seconds, is_without_packets
 from mlbatch.discovery.router import Role
 from mlbatch.discovery.sampler import clock_watch, split_by_kind
@@ -50,7 +50,7 @@ from mlbatch.rig.rig import (
     UnknownExtrinsics,
 )
 from mlbatch.rig.write import write_rig
-from mlbatch.types import StreamTable
+from mlbatch.types import PacketBatch, Recording, StreamTable
 from mlbatch.units import NS_PER_MS, NS_PER_S
 
 # Called with the bytes read so far, and with those of all recordings.
@@ -492,8 +492,18 @@ def _measure(
     measured = {sensor: _Measured(sensor) for sensor in discovery.sensors}
     recordings = discovery.recordings
     size_bytes = sum(recording.size_bytes for recording in recordings)
+    shared = SharedLidars()
+
+    def compare(recording: Recording, batch: PacketBatch | None) -> None:
+        if batch is None:
+            return
+        for kind, index in split_by_kind(batch):
+            for sensor in discovery.sensors:
+                if kind in sensor.kinds:
+                    shared.add(recording, sensor, batch, index)
+
     read = merge if whole else first_seconds
-    for batch in read(recordings, is_without_packets):
+    for batch in read(recordings, is_without_packets, compare):
         topics.add(batch.messages)
         if progress is not None:
             progress(sum(recording.position_bytes for recording in recordings), size_bytes)

@@ -15,6 +15,7 @@ import numpy as np
 from mlbatch.arrays import BoolArray, F64Array, I64Array, median
 from mlbatch.discovery.sampler import Sampler
 from mlbatch.discovery.types import DetectedSensor, PacketKind
+from mlbatch.lidar.content_keys import content_keys
 from mlbatch.lidar.geometry import rotor_ticks
 from mlbatch.lidar.interface import Lidar
 from mlbatch.units import NS_PER_MS, NS_PER_S
@@ -58,8 +59,9 @@ def shared_address(sampler: Sampler, sensor: DetectedSensor) -> str:
                 f"sensor {sensor.name}: {sampler.table.streams[kind.stream]}: expected packets of "
                 f"one {lidar.model}, found two sequences of packets of "
                 f"{packets.span_ns / NS_PER_MS:.3f} ms that each continue, one with {one}, the "
-                f"other with {other}: several lidars share the address; give each an address or "
-                "a port of its own and record again"
+                f"other with {other}: several lidars share the address, or recordings of two "
+                "drives were joined; give each an address or a port of its own and record again, "
+                "or convert each recording alone"
             )
     return ""
 
@@ -68,9 +70,10 @@ class _Packets(NamedTuple):
     """Sampled packets of one kind, in receive order; (n,) each.
 
     position: among all packets of the kind; stamp_ns: of the first column; rotor: revolutions,
-    modulo 1; number: of the sequence, or none (< 0). Of a packet: span_ns, time from the first to
-    the last column; step_ns and turn, time and revolutions from packet to packet (turn 0: no
-    rotor).
+    modulo 1; number: of the sequence, or none (< 0); content: equal in copies.
+
+    Of a packet: span_ns, time from the first to the last column; step_ns and turn, time and
+    revolutions from packet to packet (turn 0: no rotor).
     """
 
     position: I64Array
@@ -78,6 +81,7 @@ class _Packets(NamedTuple):
     stamp_ns: I64Array
     rotor: F64Array
     number: I64Array
+    content: I64Array
     span_ns: float
     step_ns: float
     turn: float
@@ -100,9 +104,10 @@ class _Packets(NamedTuple):
         return int(self.stamp_ns[offset_ns > between_ns].min())
 
     def in_order(self, run: I64Array) -> I64Array:
-        """Rows of a run by timestamp, one of each timestamp."""
-        _, first = np.unique(self.stamp_ns[run], return_index=True)
-        return run[first]
+        """Rows of a run by timestamp, one of each packet."""
+        _, first = np.unique(self.content[run], return_index=True)
+        rows = run[first]
+        return rows[self.stamp_ns[rows].argsort(kind="stable")]
 
     def continued(self, rows: I64Array, most_lost: int = 0) -> BoolArray:
         """(n, n) True where the second of two rows begins where the first one ends.
@@ -168,6 +173,7 @@ def _packets(sampler: Sampler, kind: PacketKind, lidar: Lidar) -> _Packets:
         stamp_ns=stamp_ns[:, 0],
         rotor=rotor[:, 0],
         number=number,
+        content=content_keys(payloads[whole]),
         span_ns=span_ns,
         step_ns=span_ns * whole_packet,
         turn=turn * whole_packet,

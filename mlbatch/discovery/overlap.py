@@ -2,7 +2,7 @@
 
 A window can contain the columns of two lidars only if they were recorded at the same time.
 Recordings with a lidar in common may follow each other, as the parts of a split recording do, but
-not at any distance.
+not at any distance. Where they overlap, they are copies: a lidar measures one thing at an instant.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ from __future__ import annotations
 import contextlib
 import datetime
 import re
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -17,17 +18,36 @@ from pathlib import Path
 import numpy as np
 
 from mlbatch import sensors
+from mlbatch.arrays import I64Array
+from mlbatch.batching.intake import NEVER, extremes
 from mlbatch.discovery.crowd import Crowd
 from mlbatch.discovery.sampler import split_by_kind
-from mlbatch.errors import MlbatchError
+from mlbatch.discovery.types import DetectedSensor
+from mlbatch.errors import MlbatchError, RecordingError
+from mlbatch.lidar.content_keys import content_keys
+from mlbatch.lidar.interface import Lidar
 from mlbatch.readers import open_recording
+from mlbatch.readers.byte_records import records
 from mlbatch.types import PacketBatch, Recording, Stream, StreamTable
-from mlbatch.units import NS_PER_S
+from mlbatch.units import NS_PER_MS, NS_PER_S
 
 # Largest time between recordings with a lidar in common: a break in a day of work, but not a day.
 MAX_BREAK_NS = 24 * 3600 * NS_PER_S
 # Packets of a kind that are described.
 _CHECKED = 16
+# The packets that contain a multiple of this are compared between recordings.
+_INSTANT_NS = 50 * NS_PER_MS
+# Largest receive time between packets that are compared.
+_NEAR_NS = NS_PER_S
+# Of each recording, bytes of a lidar that are looked at before another recording overlaps it.
+_FIRST_BYTES = 8 << 20
+# Instants of a lidar that are kept of each recording.
+_MOST_INSTANTS = 4096
+# Least number of instants with other packets, and least share of those that both recordings have: a
+# packet may be damaged. After so many of which most agree, the recordings are copies.
+_MIN_OTHERS = 3
+_OTHERS = 0.5
+_SETTLED = 200
 
 
 @dataclass(slots=True)
@@ -150,6 +170,93 @@ def iso(host_ns: int) -> str:
     except (OverflowError, ValueError, OSError):
         return f"{host_ns / NS_PER_S:.3f} s"
     return f"{moment:%Y-%m-%dT%H:%M:%S}.{host_ns % NS_PER_S // 10**6:03d}Z"
+
+
+# -- packets of one lidar in several recordings ---------------------------------------------------
+
+
+@dataclass(slots=True)
+class _Copies:
+    """Instants that two recordings have of one lidar; others: those with other packets."""
+
+    instants: int = 0
+    others: int = 0
+
+
+class SharedLidars:
+    """Compares the packets of lidars that several recordings have at the same receive times."""
+
+    def __init__(self) -> None:
+        # By sensor and recording: newest receive time, bytes, and by instant the packets' contents.
+        self._last_ns: dict[str, dict[Path, int]] = {}
+        self._bytes: Counter[tuple[str, Path]] = Counter()
+        self._contents: dict[tuple[str, Path], dict[int, set[int]]] = {}
+        self._copies: dict[tuple[str, Path, Path], _Copies] = {}
+
+    def add(
+        self, recording: Recording, sensor: DetectedSensor, batch: PacketBatch, index: I64Array
+    ) -> None:
+        """Add packets that may be of a sensor; RecordingError if another recording has others."""
+        path = recording.path
+        host_ns = batch.host_ns[index]
+        last_ns = self._last_ns.setdefault(sensor.name, {})
+        last_ns[path] = max(last_ns.get(path, 0), int(host_ns.max()))
+        near = [
+            other
+            for other, other_ns in last_ns.items()
+            if other != path
+            and other_ns + _NEAR_NS >= int(host_ns.min())
+            and self._compared(sensor, path, other).instants < _SETTLED
+        ]
+        self._bytes[sensor.name, path] += sensor.lidar.packet_size * len(index)
+        if not near and self._bytes[sensor.name, path] > _FIRST_BYTES:
+            return
+        kept = self._contents.setdefault((sensor.name, path), {})
+        for instant, content in _instants(sensor.lidar, batch, index, host_ns):
+            if instant in kept:
+                kept[instant].add(content)
+                continue
+            kept[instant] = {content}
+            if len(kept) > _MOST_INSTANTS:
+                del kept[next(iter(kept))]
+            for other in near:
+                self._compare(sensor, instant, content, path, other)
+
+    def _compared(self, sensor: DetectedSensor, one: Path, other: Path) -> _Copies:
+        key = (sensor.name, min(one, other), max(one, other))
+        return self._copies.setdefault(key, _Copies())
+
+    def _compare(
+        self, sensor: DetectedSensor, instant: int, content: int, path: Path, other: Path
+    ) -> None:
+        contents = self._contents.get((sensor.name, other), {}).get(instant)
+        if contents is None:
+            return
+        copies = self._compared(sensor, path, other)
+        copies.instants += 1
+        copies.others += content not in contents
+        if copies.others >= _MIN_OTHERS and copies.others > _OTHERS * copies.instants:
+            raise RecordingError(
+                f"{min(path, other)}, {max(path, other)}: expected packets of {sensor.name} of "
+                f"different times, or copies, found others in {copies.others} of "
+                f"{copies.instants} instants that both have (the last at "
+                f"{instant * _INSTANT_NS / NS_PER_S:.2f} s of its clock): recordings of two "
+                "drives; convert each alone"
+            )
+
+
+def _instants(
+    lidar: Lidar, batch: PacketBatch, index: I64Array, host_ns: I64Array
+) -> Iterator[tuple[int, int]]:
+    """Multiples of `_INSTANT_NS` within intact packets of a lidar, and the packets' contents."""
+    layout = np.dtype([("byte", "u1", lidar.packet_size)])
+    packets = records(batch.data, layout, batch.start[index])["byte"]
+    good = lidar.sent_by_me(packets) & (lidar.faults(packets) == 0)
+    packets = packets[good]
+    low, high = extremes(lidar.column_headers(packets, host_ns[good]))
+    instant = high // _INSTANT_NS
+    rows = np.flatnonzero((high > NEVER) & (instant * _INSTANT_NS >= low))
+    yield from zip(instant[rows].tolist(), content_keys(packets[rows]).tolist(), strict=True)
 
 
 # -- captures -------------------------------------------------------------------------------------

@@ -24,6 +24,7 @@ from mlbatch.frames.naming import nearest_topic
 from mlbatch.lidar.interface import Calibration, Evidence, Lidar
 from mlbatch.readers import has_packets, merge
 from mlbatch.readers.datasets import BAG_METADATA
+from mlbatch.readers.merge import Seen
 from mlbatch.rig.rig import Rig, RigSensor
 from mlbatch.types import Message, PacketBatch, Recording, StreamTable, Topic
 from mlbatch.units import NS_PER_S
@@ -146,15 +147,19 @@ def probe(
 
 
 def first_seconds(
-    recordings: Sequence[Recording], by_log_time: ByLogTime | None = None
+    recordings: Sequence[Recording],
+    by_log_time: ByLogTime | None = None,
+    seen: Seen | None = None,
 ) -> Iterator[PacketBatch]:
-    """Yield all packets up to 10 s after the first lidar packet; by_log_time: as for `merge`.
+    """Yield all packets up to 10 s after the first lidar packet.
+
+    by_log_time, seen: as for `merge`.
 
     A capture may start long before the lidars do. The end does not depend on the size of batches.
     """
     end_ns: int | None = None
     crowd = Crowd()
-    merged = merge(recordings) if by_log_time is None else merge(recordings, by_log_time)
+    merged = merge(recordings) if by_log_time is None else merge(recordings, by_log_time, seen)
     with contextlib.closing(merged) as batches:
         for batch in batches:
             if end_ns is None:

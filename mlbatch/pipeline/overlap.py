@@ -10,7 +10,7 @@ from mlbatch import sensors
 from mlbatch.arrays import U8Array
 from mlbatch.discovery.crowd import Crowd
 from mlbatch.discovery.discover import Discovery
-from mlbatch.discovery.overlap import LidarSpan, lidar_name, problem
+from mlbatch.discovery.overlap import LidarSpan, SharedLidars, lidar_name, problem
 from mlbatch.discovery.probe import PROBE_NS
 from mlbatch.discovery.router import Role
 from mlbatch.discovery.sampler import SAMPLES_PER_KIND, split_by_kind
@@ -25,6 +25,7 @@ class RunOverlap:
     def __init__(self, recordings: Sequence[Recording], setup: Discovery) -> None:
         self._setup = setup
         self._spans = {id(one): LidarSpan(one.path) for one in recordings}
+        self._shared = SharedLidars()
         self._crowds = {id(one): Crowd() for one in recordings}
         # By recording and kind, as lidars of several recordings may have one address.
         self._lidars: dict[tuple[int, PacketKind], list[str]] = {}
@@ -49,6 +50,9 @@ class RunOverlap:
             host_ns = batch.host_ns[index]
             for name in names:
                 span.add(name, int(host_ns.min()), int(host_ns.max()))
+            for sensor in self._setup.sensors:
+                if sensor.name in names:
+                    self._shared.add(recording, sensor, batch, index)
         newest_ns = int(batch.host_ns[-1])
         if is_new and span.first_ns is not None:
             self._begun_ns = newest_ns

@@ -28,7 +28,9 @@ POINTS = 27998
 
 def without_timing(report: Report) -> Report:
     """What does not depend on the machine."""
-    return {key: value for key, value in report.items() if key not in ("timing", "command", "identity")}
+    return {
+        key: value for key, value in report.items() if key not in ("timing", "command", "identity")
+    }
 
 
 # -- what is printed ------------------------------------------------------------------------------

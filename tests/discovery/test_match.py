@@ -14,7 +14,7 @@ from mlbatch.discovery.match import describe, release
 from mlbatch.readers import open_recording
 from mlbatch.types import StreamTable
 from tests.builders.captures import udp_frame, write_pcap
-from tests.builders.run import command
+from tests.builders.run import Told, command
 from tests.builders.sessions import SMALL, Unit, write_session
 from tests.matrix.lidars import NS_PER_MS, NS_PER_S, VENDORS, Sent, Spell, write_metadata
 
@@ -41,17 +41,27 @@ def both(vendor: str, ahead_ns: int, clock_ahead_ns: int = 0) -> Sent:
     return mixed.where(np.argsort(mixed.host_ns, kind="stable"))
 
 
-def converted(vendor: str, sent: Sent, folder: Path) -> tuple[int, str]:
-    """Exit code and error of a conversion of these packets, all from one address."""
-    write_metadata(folder)
+def captured(vendor: str, sent: Sent, path: Path) -> Path:
+    """A capture of these packets, all from one address."""
     frames = [
         (int(host_ns), frame)
         for host_ns, payload in zip(sent.host_ns, sent.payloads, strict=True)
         for frame in udp_frame(payload, VENDORS[vendor].ip, sport=9000, dport=VENDORS[vendor].port)
     ]
-    capture = write_pcap(folder / "drive.pcap", frames)
+    return write_pcap(path, frames)
+
+
+def told(vendor: str, folder: Path, verb: str, *captures: Path, words: str = "") -> Told:
+    """What a command says of captures of a lidar."""
+    write_metadata(folder)
     files: list[str | Path] = ["--metadata", folder / FILES[vendor]] if FILES[vendor] else []
-    result = command("convert", capture, *files, "--dry-run", "--quiet")
+    return command(verb, *captures, *files, *words.split())
+
+
+def converted(vendor: str, sent: Sent, folder: Path) -> tuple[int, str]:
+    """Exit code and error of a conversion of these packets, all from one address."""
+    capture = captured(vendor, sent, folder / "drive.pcap")
+    result = told(vendor, folder, "convert", capture, words="--dry-run --quiet")
     return result.code, result.err
 
 
@@ -105,6 +115,49 @@ ONE: Mapping[str, Callable[[Sent], Sent]] = {
 def test_one_lidar_is_not_refused(vendor: str, change: str, tmp_path: Path) -> None:
     code, err = converted(vendor, ONE[change](one(vendor)), tmp_path)
     assert code == 0, err
+
+
+def other_drive(sent: Sent, late_ns: int) -> Sent:
+    """Packets of the same timestamps and numbers with other readings."""
+    middle = len(sent.payloads[0]) // 2
+    payloads = tuple(
+        one[:middle] + bytes(byte ^ 0x15 for byte in one[middle : middle + 2]) + one[middle + 2 :]
+        for one in sent.payloads
+    )
+    return replace(sent, payloads=payloads, host_ns=sent.host_ns + late_ns)
+
+
+@pytest.mark.parametrize("late_ms", [0, 30, 400])
+@pytest.mark.parametrize("vendor", VENDORS)
+def test_recordings_of_two_drives_are_refused(vendor: str, late_ms: int, tmp_path: Path) -> None:
+    """Sensors without a set clock count from the same start on every drive."""
+    first = captured(vendor, one(vendor), tmp_path / "first.pcap")
+    drive = other_drive(one(vendor), late_ms * NS_PER_MS)
+    second = captured(vendor, drive, tmp_path / "second.pcap")
+    for verb, words in (("convert", "--dry-run --quiet"), ("inspect", ""), ("inspect", "--whole")):
+        done = told(vendor, tmp_path, verb, first, second, words=words)
+        assert done.code == 1, done.out
+        assert len(done.err.splitlines()) == 1
+        assert "expected packets of " in done.err
+        assert "two drives" in done.err
+        assert "convert each" in done.err
+
+
+@pytest.mark.parametrize("late_ms", [0, 30])
+@pytest.mark.parametrize("vendor", VENDORS)
+def test_a_copy_of_a_recording_changes_nothing(vendor: str, late_ms: int, tmp_path: Path) -> None:
+    sent = one(vendor)
+    first = captured(vendor, sent, tmp_path / "first.pcap")
+    copy = replace(sent, host_ns=sent.host_ns + late_ms * NS_PER_MS)
+    second = captured(vendor, copy, tmp_path / "second.pcap")
+    words = "--dry-run --quiet"
+    alone, twice = (
+        told(vendor, tmp_path, "convert", *paths, words=words)
+        for paths in ([first], [first, second])
+    )
+    assert (alone.code, twice.code) == (0, 0), twice.err
+    assert twice.err == alone.err
+    assert told(vendor, tmp_path, "inspect", first, second).code == 0
 
 
 def test_inspect_notes_it(tmp_path: Path) -> None:
