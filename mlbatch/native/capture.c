@@ -1,7 +1,7 @@
-/* Captures: records of a pcap file to frames, frames to datagrams and fragments.
+/* Captures: records of a pcap file to frames, frames to UDP datagrams, fragments to datagrams.
 
-   Layouts: draft-ietf-opsawg-pcap, section 5; RFC 791 (IPv4); RFC 768 (UDP). The same verdicts as
-   `readers/capture/frames.py`, to which everything unusual is left. */
+   Layouts: draft-ietf-opsawg-pcap, section 5; ethertypes and numbers of headers: IANA; RFC 791
+   (IPv4), 8200 (IPv6), 4302 (authentication header), 768 (UDP). */
 #include <string.h>
 
 #include "native.h"
@@ -10,8 +10,14 @@
 #include <emmintrin.h>
 #endif
 
-enum { RECORD_BYTES = 16, ETHERNET_BYTES = 14, IP_BYTES = 20, UDP_BYTES = 8 };
-enum { IPV4_TYPE = 0x0800, UDP = 17, MORE_FRAGMENTS = 0x2000, FRAGMENT_OFFSET = 0x1FFF };
+enum { RECORD_BYTES = 16, IPV4_BYTES = 20, IPV6_BYTES = 40, UDP_BYTES = 8 };
+enum { IPV4_TYPE = 0x0800, IPV6_TYPE = 0x86DD };
+enum { MORE_FRAGMENTS = 0x2000, FRAGMENT_OFFSET = 0x1FFF, MOST_DATAGRAM_BYTES = 65535 };
+/* Protocols, and headers of IPv6. */
+enum { HOP_BY_HOP, UDP = 17, ROUTING = 43, FRAGMENT_HEADER, AUTHENTICATION = 51, DESTINATION = 60 };
+enum { MOBILITY = 135, HOST_IDENTITY = 139, SHIM6 };
+/* No network adds more; the bounds keep a crafted packet cheap. */
+enum { MOST_TAGS = 8, MOST_HEADERS = 16 };
 /* Why a walk ends: `native/capture.py`. */
 enum { NO_ROOM, CUT, TOO_LONG };
 /* Headers of so many frames ahead are asked for: what was just read is in no near cache. */
@@ -30,6 +36,11 @@ static int64_t high(const uint8_t *byte)
 static int64_t high2(const uint8_t *byte)
 {
     return byte[0] << 8 | byte[1];
+}
+
+static uint64_t high8(const uint8_t *byte)
+{
+    return (uint64_t)high(byte) << 32 | (uint64_t)high(byte + 4);
 }
 
 static int64_t word(const uint8_t *byte, int64_t is_swapped)
@@ -86,134 +97,396 @@ EXPORT int64_t mlbatch_walk(const uint8_t *data, int64_t begin, int64_t end, int
     return count;
 }
 
-/* A whole datagram: frame, first byte, size, source address, destination port. */
-static int add_datagram(const uint8_t *data, int64_t frame, int64_t packet, int64_t body,
-                        int64_t stop, int64_t room, int64_t *out)
+/* -- frames to datagrams and fragments ----------------------------------------------------- */
+
+/* Verdicts on a frame. The first ones are counted: `CAPTURE_REASONS` of the ledger. */
+enum { NOT_IP, NOT_UDP, TRUNCATED, FRAGMENT, FRAGMENT_LOST, WHOLE, PART };
+
+/* Content of an IP packet: a datagram from its UDP header on (WHOLE), or a piece of one (PART). */
+typedef struct {
+    uint64_t key[KEY_WORDS]; /* as of `FragmentSet`; a datagram has no identification */
+    int64_t start;
+    int64_t size;
+    int64_t offset; /* of the piece */
+    int64_t more;   /* whether pieces follow */
+} Packet;
+
+/* A datagram is as long as its UDP header says, if that many bytes were captured: some sensors
+   announce a wrong IP length, and Ethernet pads short frames. */
+static int read_udp(const uint8_t *data, int64_t at, int64_t stop, Packet *packet)
 {
-    const int64_t size = high2(data + body + 4);
-    if (size < UDP_BYTES || body + size > stop)
-        return 0;
-    out[0] = frame;
-    out[room] = body + UDP_BYTES;
-    out[2 * room] = size - UDP_BYTES;
-    out[3 * room] = high(data + packet + 12);
-    out[4 * room] = high2(data + body + 2);
-    return 1;
+    if (at + UDP_BYTES > stop)
+        return TRUNCATED;
+    packet->start = at;
+    packet->size = high2(data + at + 4);
+    return packet->size < UDP_BYTES || at + packet->size > stop ? TRUNCATED : WHOLE;
 }
 
-/* A fragment: frame, source, destination, identification, offset, more follow, first byte, size. */
-static int add_fragment(const uint8_t *data, int64_t frame, int64_t packet, int64_t body,
-                        int64_t stop, int64_t room, int64_t *out)
+/* A fragment has no UDP length: its IP length, which gives its end, has to be right. */
+static int read_part(int64_t at, int64_t end, int64_t stop, Packet *packet)
 {
-    const int64_t end = packet + high2(data + packet + 2), place = high2(data + packet + 6);
-    if (end <= body || end > stop)
-        return 0;
-    out[0] = frame;
-    out[room] = high(data + packet + 12);
-    out[2 * room] = high(data + packet + 16);
-    out[3 * room] = high2(data + packet + 4);
-    out[4 * room] = (place & FRAGMENT_OFFSET) * 8;
-    out[5 * room] = (place & MORE_FRAGMENTS) != 0;
-    out[6 * room] = body;
-    out[7 * room] = end - body;
-    return 1;
+    packet->start = at;
+    packet->size = end - at;
+    return end <= at || end > stop ? TRUNCATED : PART;
 }
 
-/* Frames of Ethernet, IPv4 and UDP to datagrams (5, frames) and fragments (8, frames); others:
-   numbers of all other frames. Return the number of datagrams; found: fragments, others. */
-EXPORT int64_t mlbatch_dissect(const uint8_t *data, int64_t data_bytes, int64_t frames,
-                               const int64_t *start, const int64_t *captured,
-                               const int64_t *original, int64_t *datagrams, int64_t *fragments,
-                               int64_t *others, int64_t *found)
+static int read_ipv4(const uint8_t *data, int64_t at, int64_t stop, Packet *packet)
 {
-    int64_t whole = 0, parts = 0, rest = 0;
+    if (at + IPV4_BYTES > stop)
+        return TRUNCATED;
+    const uint8_t *header = data + at;
+    const int64_t body = at + (header[0] & 15) * 4, place = high2(header + 6);
+    if (header[0] >> 4 != 4 || body < at + IPV4_BYTES)
+        return NOT_IP;
+    if (header[9] != UDP)
+        return NOT_UDP;
+    packet->key[0] = UINT64_C(4) << 32;
+    packet->key[1] = packet->key[3] = 0;
+    packet->key[2] = (uint64_t)high(header + 12);
+    packet->key[4] = (uint64_t)high(header + 16);
+    if (!(place & (MORE_FRAGMENTS | FRAGMENT_OFFSET)))
+        return read_udp(data, body, stop, packet);
+    packet->key[0] |= (uint64_t)high2(header + 4);
+    packet->offset = (place & FRAGMENT_OFFSET) * 8;
+    packet->more = (place & MORE_FRAGMENTS) != 0;
+    return read_part(body, at + high2(header + 2), stop, packet);
+}
+
+static int read_ipv6(const uint8_t *data, int64_t at, int64_t stop, Packet *packet)
+{
+    if (at + IPV6_BYTES > stop)
+        return TRUNCATED;
+    if (data[at] >> 4 != 6)
+        return NOT_IP;
+    const int64_t end = at + IPV6_BYTES + high2(data + at + 4);
+    int kind = data[at + 6];
+    packet->key[0] = UINT64_C(6) << 32;
+    for (int word = 1; word < KEY_WORDS; word++)
+        packet->key[word] = high8(data + at + 8 * word);
+    at += IPV6_BYTES;
+    for (int headers = 0; headers < MOST_HEADERS; headers++) {
+        if (kind == UDP)
+            return read_udp(data, at, stop, packet);
+        if (kind == FRAGMENT_HEADER) {
+            if (at + 8 > stop)
+                return TRUNCATED;
+            const int64_t place = high2(data + at + 2);
+            kind = data[at];
+            packet->key[0] = UINT64_C(6) << 32 | (uint64_t)high(data + at + 4);
+            at += 8;
+            /* A fragment that is the whole datagram (RFC 6946) is read like one. */
+            if (!(place & ~6))
+                continue;
+            packet->offset = place & ~7;
+            packet->more = place & 1;
+            return kind == UDP ? read_part(at, end, stop, packet) : NOT_UDP;
+        }
+        const int is_plain = kind == HOP_BY_HOP || kind == ROUTING || kind == DESTINATION
+            || kind == MOBILITY || kind == HOST_IDENTITY || kind == SHIM6;
+        if (!is_plain && kind != AUTHENTICATION)
+            return NOT_UDP;
+        if (at + 2 > stop)
+            return TRUNCATED;
+        kind = data[at];
+        at += is_plain ? (data[at + 1] + 1) * 8 : (data[at + 1] + 2) * 4;
+    }
+    return NOT_UDP;
+}
+
+/* A packet behind a link header that ends at `at`, with an ethertype, and behind VLAN tags: two
+   bytes of tag, then the ethertype of the next header. */
+static int read_typed(const uint8_t *data, int64_t type_at, int64_t at, int64_t stop,
+                      Packet *packet)
+{
+    if (at > stop)
+        return TRUNCATED;
+    int64_t type = high2(data + type_at);
+    for (int tags = 0; tags < MOST_TAGS; tags++) {
+        if (type != 0x8100 && type != 0x88A8 && type != 0x9100)
+            break;
+        if (at + 4 > stop)
+            return TRUNCATED;
+        type = high2(data + at + 2);
+        at += 4;
+    }
+    if (type == IPV4_TYPE)
+        return read_ipv4(data, at, stop, packet);
+    return type == IPV6_TYPE ? read_ipv6(data, at, stop, packet) : NOT_IP;
+}
+
+/* A packet that begins with its version. */
+static int read_ip(const uint8_t *data, int64_t at, int64_t stop, Packet *packet)
+{
+    if (at == stop)
+        return TRUNCATED;
+    if (data[at] >> 4 == 4)
+        return read_ipv4(data, at, stop, packet);
+    return data[at] >> 4 == 6 ? read_ipv6(data, at, stop, packet) : NOT_IP;
+}
+
+/* A packet behind an address family of four bytes, of a host of either byte order. */
+static int read_family(const uint8_t *data, int64_t at, int64_t stop, Packet *packet)
+{
+    if (at + 4 > stop)
+        return TRUNCATED;
+    const int family = data[at] | data[at + 3], is_ipv4 = family == 2;
+    /* IPv6 differs with the system. */
+    const int is_ipv6 = family == 10 || family == 24 || family == 28 || family == 30;
+    if (data[at + 1] | data[at + 2] || !(is_ipv4 || is_ipv6))
+        return NOT_IP;
+    at += 4;
+    if (at < stop && data[at] >> 4 != (is_ipv4 ? 4 : 6))
+        return NOT_IP;
+    return read_ip(data, at, stop, packet);
+}
+
+/* Link types: tcpdump.org/linktypes.html; `LINKS` of `readers/capture/frames.py`. */
+static int read_frame(const uint8_t *data, int64_t at, int64_t stop, int64_t link, Packet *packet)
+{
+    switch (link) {
+    case 1: /* Ethernet */
+        return read_typed(data, at + 12, at + 14, stop, packet);
+    case 113: /* Linux cooked */
+        return read_typed(data, at + 14, at + 16, stop, packet);
+    case 276: /* Linux cooked, 2 */
+        return read_typed(data, at, at + 20, stop, packet);
+    case 0: /* BSD loopback */
+    case 108:
+        return read_family(data, at, stop, packet);
+    case 12: /* raw IP */
+    case 14:
+    case 101:
+    case 228:
+    case 229:
+        return read_ip(data, at, stop, packet);
+    default:
+        return NOT_IP;
+    }
+}
+
+/* Number of the stream of a packet; a new one is the next. -1: the table is full. */
+static int64_t stream_of(Dissection *all, const uint64_t *key, int64_t port)
+{
+    const uint64_t end = key[0] >> 32 << 16 | (uint64_t)port;
+    const uint64_t golden = UINT64_C(0x9E3779B97F4A7C15);
+    uint64_t slot = ((key[1] * golden ^ key[2]) * golden ^ end) * golden >> 32;
+    for (;; slot++) {
+        int64_t *number = all->stream_slots + slot % (uint64_t)all->slot_count;
+        /* One more, so that zeros are free. */
+        const int64_t at = *number ? *number - 1 : all->stream_count;
+        uint64_t *stream = all->streams + STREAM_WORDS * at;
+        if (!*number) {
+            if (all->stream_count == all->most_streams)
+                return -1;
+            memcpy(stream, key + 1, 2 * sizeof *key);
+            stream[2] = end;
+            *number = ++all->stream_count;
+        }
+        if (stream[0] == key[1] && stream[1] == key[2] && stream[2] == end)
+            return at;
+    }
+}
+
+/* Add the datagram whose UDP header is at `at` to those found. */
+static void deliver(Dissection *all, const uint8_t *data, const uint64_t *key, int64_t at,
+                    int64_t host_ns)
+{
+    int64_t *datagram = all->datagrams + all->datagram_count++;
+    datagram[0] = at + UDP_BYTES;
+    datagram[all->room] = high2(data + at + 4) - UDP_BYTES;
+    datagram[2 * all->room] = stream_of(all, key, high2(data + at + 2));
+    datagram[3 * all->room] = host_ns;
+}
+
+/* -- fragments to datagrams ---------------------------------------------------------------- */
+
+static const uint8_t *part_bytes(const Dissection *all, const uint8_t *data, int64_t part)
+{
+    return (all->parts[part].is_kept ? all->kept : data) + all->parts[part].start;
+}
+
+/* Remove a set, whose frames are counted as `reason`. */
+static void remove_set(Dissection *all, int64_t number, int reason)
+{
+    FragmentSet *set = all->sets + number;
+    all->skipped[reason] += set->frames;
+    if (set->inherited >= 0)
+        all->settled[set->inherited] = reason;
+    while (set->top >= 0) {
+        FragmentPart *part = all->parts + set->top;
+        const int64_t below = part->below;
+        if (!part->is_kept)
+            all->loose_bytes -= part->size;
+        all->held_bytes -= part->size;
+        part->below = all->free_part;
+        all->free_part = set->top;
+        set->top = below;
+    }
+    all->set_count--;
+    memmove(set, set + 1, (size_t)(all->set_count - number) * sizeof *set);
+}
+
+/* Advance the clock; remove sets that are too old. */
+static void expire(Dissection *all, int64_t host_ns)
+{
+    const int is_other_clock = host_ns < all->now_ns - all->most_age_ns;
+    if (is_other_clock || host_ns > all->now_ns)
+        all->now_ns = host_ns;
+    const int64_t oldest_ns = all->now_ns - all->most_age_ns;
+    while (all->set_count && (is_other_clock || all->sets[0].birth_ns < oldest_ns))
+        remove_set(all, 0, FRAGMENT_LOST);
+}
+
+static int64_t open_set(Dissection *all, const uint64_t *key)
+{
+    const size_t key_bytes = KEY_WORDS * sizeof *key;
+    if (all->first_count < all->most_first) {
+        int64_t number = 0;
+        while (number < all->first_count
+               && memcmp(all->first_keys + KEY_WORDS * number, key, key_bytes))
+            number++;
+        if (number == all->first_count)
+            memcpy(all->first_keys + KEY_WORDS * all->first_count++, key, key_bytes);
+    }
+    if (all->set_count == all->most_sets)
+        remove_set(all, 0, FRAGMENT_LOST);
+    FragmentSet *set = all->sets + all->set_count;
+    *set = (FragmentSet){.birth_ns = all->now_ns, .total = -1, .top = -1, .inherited = -1};
+    memcpy(set->key, key, key_bytes);
+    return all->set_count++;
+}
+
+/* Join the parts of a complete set: where the first one is, if the frames follow each other, else
+   in the front of `data`. */
+static void complete(Dissection *all, uint8_t *data, int64_t number, int64_t host_ns)
+{
+    FragmentSet *set = all->sets + number;
+    FragmentPart *parts = all->parts;
+    int64_t first = -1;
+    int is_row = 1;
+    for (int64_t at = set->top, below; at >= 0; at = below) {
+        is_row &= !parts[at].is_kept;
+        if (first >= 0)
+            is_row &= parts[first].frame == parts[at].frame + 1
+                && parts[first].start >= parts[at].start + parts[at].size;
+        below = parts[at].below;
+        parts[at].below = first;
+        first = at;
+    }
+    /* From now on the parts are in order. */
+    set->top = first;
+    const int64_t length =
+        parts[first].size < UDP_BYTES ? 0 : high2(part_bytes(all, data, first) + 4);
+    if (length < UDP_BYTES || length > set->total) {
+        remove_set(all, number, FRAGMENT_LOST);
+        return;
+    }
+    const int64_t begin = is_row ? parts[first].start : all->front;
+    if (!is_row)
+        all->front += set->total;
+    for (int64_t at = is_row ? parts[first].below : first; at >= 0; at = parts[at].below)
+        memmove(data + begin + parts[at].offset, part_bytes(all, data, at),
+                (size_t)parts[at].size);
+    deliver(all, data, set->key, begin, host_ns);
+    /* The completing frame is the datagram's. */
+    set->frames--;
+    remove_set(all, number, FRAGMENT);
+}
+
+/* The rules of `readers/capture/dissector.py` for one fragment. */
+static void add_fragment(Dissection *all, uint8_t *data, const Packet *packet, int64_t frame,
+                         int64_t host_ns)
+{
+    FragmentPart *parts = all->parts;
+    const int64_t end = packet->offset + packet->size;
+    expire(all, host_ns);
+    int64_t number = all->set_count - 1;
+    while (number >= 0 && memcmp(all->sets[number].key, packet->key, sizeof packet->key))
+        number--;
+    /* Its neighbours: `above` begins at its offset or later. */
+    int64_t above = -1, below = number < 0 ? -1 : all->sets[number].top;
+    for (; below >= 0 && parts[below].offset >= packet->offset; below = parts[below].below)
+        above = below;
+    if (above >= 0 && parts[above].offset == packet->offset) {
+        FragmentSet *set = all->sets + number;
+        if (parts[above].size == packet->size && packet->more == (end != set->total)
+            && !memcmp(part_bytes(all, data, above), data + packet->start, (size_t)packet->size)) {
+            set->frames++;
+            return;
+        }
+        if (packet->offset == 0) {
+            remove_set(all, number, FRAGMENT_LOST);
+            number = above = -1;
+        }
+    }
+    if (number < 0)
+        number = open_set(all, packet->key);
+    FragmentSet *set = all->sets + number;
+    set->frames++;
+    const int64_t limit = set->total < 0 ? MOST_DATAGRAM_BYTES : set->total;
+    if (end > limit || (!packet->more && (set->total >= 0 || above >= 0))
+        || (above >= 0 && parts[above].offset < end)
+        || (below >= 0 && parts[below].offset + parts[below].size > packet->offset)) {
+        remove_set(all, number, FRAGMENT_LOST);
+        return;
+    }
+    const int64_t at = all->free_part >= 0 ? all->free_part : all->part_count++;
+    if (at == all->free_part)
+        all->free_part = parts[at].below;
+    parts[at] = (FragmentPart){below, packet->offset, packet->size, packet->start, 0, frame};
+    if (above >= 0)
+        parts[above].below = at;
+    else
+        set->top = at;
+    set->received += packet->size;
+    all->held_bytes += packet->size;
+    all->loose_bytes += packet->size;
+    if (!packet->more)
+        set->total = end;
+    if (set->received == set->total)
+        complete(all, data, number, host_ns);
+}
+
+/* Find the datagrams of frames (first byte, captured and original length, link type, receive
+   time). There is room for `frames` further datagrams and parts, and in the front of `data` for
+   those that are joined. */
+EXPORT void mlbatch_dissect(Dissection *all, uint8_t *data, int64_t frames, const int64_t *start,
+                            const int64_t *captured, const int64_t *original, const int64_t *link,
+                            const int64_t *host_ns)
+{
     for (int64_t frame = 0; frame < frames; frame++) {
-        const int64_t first = start[frame], size = captured[frame];
-        const int is_inside = first >= 0 && size >= ETHERNET_BYTES + IP_BYTES + UDP_BYTES
-            && first <= data_bytes && size <= data_bytes - first && original[frame] <= size;
-        int is_usual = 0;
-        if (is_inside) {
-            const int64_t packet = first + ETHERNET_BYTES, stop = first + size;
-            const int64_t body = packet + (data[packet] & 15) * 4;
-            const int is_udp = high2(data + first + 12) == IPV4_TYPE && data[packet] >> 4 == 4
-                && data[packet + 9] == UDP && packet + IP_BYTES <= body && body + UDP_BYTES <= stop;
-            if (is_udp && (high2(data + packet + 6) & (MORE_FRAGMENTS | FRAGMENT_OFFSET))) {
-                is_usual =
-                    add_fragment(data, frame, packet, body, stop, frames, fragments + parts);
-                parts += is_usual;
-            } else if (is_udp) {
-                is_usual =
-                    add_datagram(data, frame, packet, body, stop, frames, datagrams + whole);
-                whole += is_usual;
-            }
-        }
-        if (!is_usual)
-            others[rest++] = frame;
+        const int64_t stop = start[frame] + captured[frame];
+        Packet packet;
+        int verdict = read_frame(data, start[frame], stop, link[frame], &packet);
+        if (verdict >= WHOLE && captured[frame] < original[frame])
+            verdict = TRUNCATED;
+        if (verdict == WHOLE)
+            deliver(all, data, packet.key, packet.start, host_ns[frame]);
+        else if (verdict == PART)
+            add_fragment(all, data, &packet, frame, host_ns[frame]);
+        else
+            all->skipped[verdict]++;
     }
-    found[0] = parts;
-    found[1] = rest;
-    return whole;
 }
 
-enum { FRAME, SOURCE, DESTINATION, IDENT, OFFSET, MORE, START, SIZE };
-enum { MOST_DATAGRAM_BYTES = 65535 };
-
-/* Join the fragments (8, count) of datagrams whose frames follow each other: each part is moved
-   down to the end of the one before. All others are left as they are, also those of a set
-   (source, destination, identification) that has other fragments before: sets (room, 3) begins
-   with the set_count open ones and takes those found. receive_ns (count) rises. Return the number
-   of datagrams (5, count); rest: numbers of the fragments that are left, rest_count of them. */
-EXPORT int64_t mlbatch_join(uint8_t *data, int64_t count, const int64_t *fragments,
-                            const int64_t *receive_ns, int64_t most_ns, int64_t set_count,
-                            int64_t room, int64_t *sets, int64_t *datagrams, int64_t *rest,
-                            int64_t *rest_count)
+/* Copy the parts that are in `data`, or all, to `kept` from byte `used` on; return the first free
+   byte. */
+EXPORT int64_t mlbatch_keep(Dissection *all, const uint8_t *data, int64_t copies_all, uint8_t *kept,
+                            int64_t used)
 {
-    const int64_t *column[SIZE + 1];
-    for (int one = 0; one <= SIZE; one++)
-        column[one] = fragments + one * count;
-    const int64_t *offset = column[OFFSET], *start = column[START], *size = column[SIZE];
-    int64_t whole = 0, left = 0;
-    for (int64_t first = 0, next; first < count; first = next) {
-        for (next = first + 1; next < count && column[MORE][next - 1]; next++) {
-            int follows = column[FRAME][next] == column[FRAME][next - 1] + 1
-                && offset[next] == offset[next - 1] + size[next - 1]
-                && start[next] >= start[next - 1] + size[next - 1];
-            for (int key = SOURCE; key <= IDENT; key++)
-                follows &= column[key][next] == column[key][first];
-            if (!follows)
-                break;
+    for (int64_t number = 0; number < all->set_count; number++)
+        for (int64_t at = all->sets[number].top; at >= 0; at = all->parts[at].below) {
+            FragmentPart *part = all->parts + at;
+            if (part->is_kept && !copies_all)
+                continue;
+            memcpy(kept + used, part_bytes(all, data, at), (size_t)part->size);
+            part->start = used;
+            part->is_kept = 1;
+            used += part->size;
         }
-        const int64_t last = next - 1, total = offset[last] + size[last];
-        const int64_t length = size[first] < UDP_BYTES ? 0 : high2(data + start[first] + 4);
-        int is_whole = offset[first] == 0 && !column[MORE][last] && total <= MOST_DATAGRAM_BYTES
-            && length >= UDP_BYTES && length <= total
-            && receive_ns[last] - receive_ns[first] <= most_ns && set_count < room;
-        for (int64_t set = 0; set < set_count && is_whole; set++)
-            is_whole = sets[3 * set] != column[SOURCE][first]
-                || sets[3 * set + 1] != column[DESTINATION][first]
-                || sets[3 * set + 2] != column[IDENT][first];
-        if (is_whole) {
-            const int64_t begin = start[first];
-            for (int64_t part = first + 1; part < next; part++)
-                memmove(data + begin + offset[part], data + start[part], (size_t)size[part]);
-            int64_t *out = datagrams + whole++;
-            out[0] = column[FRAME][last];
-            out[count] = begin + UDP_BYTES;
-            out[2 * count] = length - UDP_BYTES;
-            out[3 * count] = column[SOURCE][first];
-            out[4 * count] = high2(data + begin + 2);
-            continue;
-        }
-        for (int64_t part = first; part < next; part++)
-            rest[left++] = part;
-        if (set_count < room) {
-            for (int key = 0; key < 3; key++)
-                sets[3 * set_count + key] = column[SOURCE + key][first];
-            set_count++;
-        }
-    }
-    *rest_count = left;
-    return whole;
+    all->kept = kept;
+    all->loose_bytes = 0;
+    return used;
 }
 
 /* Copy source[source_at[i] : + bytes[i]] to target[target_at[i] : ...] for all i; source and

@@ -1,9 +1,6 @@
-"""Compiled loops over captures: frames in records, datagrams and fragments in frames."""
+"""Compiled loops over captures: frames in records, bytes of packets."""
 
 from __future__ import annotations
-
-from collections.abc import Sequence
-from typing import NamedTuple
 
 import numpy as np
 
@@ -14,20 +11,10 @@ from mlbatch.native.library import address, library
 NO_ROOM, CUT, TOO_LONG = range(3)
 # Room for frames of one walk.
 _ROOM = 1 << 14
-# Open sets of fragments that `join` leaves out, at most.
-JOIN_SETS = 64
-
-
-class Found(NamedTuple):
-    """Rows of Ethernet frames: columns of datagrams (5, n) and fragments (8, n); other frames."""
-
-    datagrams: I64Array
-    fragments: I64Array
-    others: I64Array
 
 
 class CaptureLoops:
-    """The loops over captures; the same results as numpy's."""
+    """The loops over captures."""
 
     def __init__(self) -> None:
         self._library = library()
@@ -56,62 +43,6 @@ class CaptureLoops:
         )
         place, why = stop.tolist()
         return columns[:, :count], place, why
-
-    def dissect(
-        self, data: U8Array, start: I64Array, captured: I64Array, original: I64Array
-    ) -> Found:
-        """Return what Ethernet frames (n,) contain that are IPv4 without tags, and the others."""
-        count = len(start)
-        inputs = [np.ascontiguousarray(column) for column in (start, captured, original)]
-        datagrams = np.empty((5, count), np.int64)
-        fragments = np.empty((8, count), np.int64)
-        others = np.empty(count, np.int64)
-        found = np.empty(2, np.int64)
-        whole = self._library.mlbatch_dissect(
-            address(data),
-            len(data),
-            count,
-            *map(address, inputs),
-            *map(address, (datagrams, fragments, others, found)),
-        )
-        parts, rest = found.tolist()
-        return Found(datagrams[:, :whole], fragments[:, :parts], others[:rest])
-
-    def join(
-        self,
-        data: U8Array,
-        fragments: I64Array,
-        receive_ns: I64Array,
-        most_ns: int,
-        open_sets: Sequence[tuple[int, int, int]],
-    ) -> tuple[I64Array, I64Array]:
-        """Join fragments whose frames follow each other, moving them together within `data`.
-
-        fragments: columns (8, n) as `dissect` found them; receive_ns: (n,) rising. Sets that are
-        open, at most JOIN_SETS, or have other fragments before are left, as are those that took
-        longer than `most_ns`. Return columns of datagrams (5, n), and rows of what is left.
-        """
-        count = fragments.shape[1]
-        start, size = fragments[6:]
-        if bool(_is_outside(data, start, size).any()) or len(receive_ns) != count:
-            raise IndexError("fragments outside of their array")
-        fragments, receive_ns = map(np.ascontiguousarray, (fragments, receive_ns))
-        sets = np.zeros((JOIN_SETS, 3), np.int64)
-        sets[: len(open_sets)] = np.array(open_sets, np.int64).reshape(-1, 3)
-        datagrams = np.empty((5, count), np.int64)
-        rest = np.empty(count, np.int64)
-        left = np.empty(1, np.int64)
-        whole = self._library.mlbatch_join(
-            address(data),
-            count,
-            address(fragments),
-            address(receive_ns),
-            most_ns,
-            len(open_sets),
-            JOIN_SETS,
-            *map(address, (sets, datagrams, rest, left)),
-        )
-        return datagrams[:, :whole], rest[: int(left[0])]
 
     def copy_runs(
         self, source: U8Array, start: I64Array, size: I64Array, out: U8Array, at_byte: I64Array

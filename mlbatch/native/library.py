@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from mlbatch.native import library_path
 
-_ABI = 10
+_ABI = 11
 _WORD = ctypes.c_int64
 _ADDRESS = ctypes.c_void_p
 _NUMBER = ctypes.c_double
@@ -28,8 +28,8 @@ _FUNCTIONS: dict[str, tuple[type[Any], ...]] = {
     "mlbatch_paced": (_ADDRESS, _ADDRESS, _WORD, *[_ADDRESS] * 5),
     "mlbatch_single": (_ADDRESS, _WORD, _ADDRESS, *[_WORD] * 3, *[_ADDRESS] * 3),
     "mlbatch_walk": (_ADDRESS, *[_WORD] * 6, _ADDRESS, _ADDRESS),
-    "mlbatch_dissect": (_ADDRESS, _WORD, _WORD, *[_ADDRESS] * 7),
-    "mlbatch_join": (_ADDRESS, _WORD, _ADDRESS, _ADDRESS, *[_WORD] * 3, *[_ADDRESS] * 4),
+    "mlbatch_dissect": (_ADDRESS, _ADDRESS, _WORD, *[_ADDRESS] * 5),
+    "mlbatch_keep": (_ADDRESS, _ADDRESS, _WORD, _ADDRESS, _WORD),
     "mlbatch_copy": (_WORD, *[_ADDRESS] * 5),
     "mlbatch_gather": (_WORD, _ADDRESS, _ADDRESS, _WORD, _ADDRESS, _WORD, _ADDRESS),
     "mlbatch_sums": (_WORD, _ADDRESS, _ADDRESS, _WORD, _ADDRESS),
@@ -54,7 +54,13 @@ _FUNCTIONS: dict[str, tuple[type[Any], ...]] = {
         *(_WORD, *[_ADDRESS] * 4, *[_WORD] * 3, _ADDRESS, _ADDRESS),
     ),
 }
-_WITHOUT_RESULT = ("mlbatch_copy", "mlbatch_gather", "mlbatch_sums", "mlbatch_cloud_pack")
+_WITHOUT_RESULT = (
+    "mlbatch_dissect",
+    "mlbatch_copy",
+    "mlbatch_gather",
+    "mlbatch_sums",
+    "mlbatch_cloud_pack",
+)
 
 
 class Ring(ctypes.Structure):
@@ -247,6 +253,38 @@ class PacedLayout(ctypes.Structure):
         ("per_s", _NUMBER),
         ("steps_per_hz", _NUMBER),
         ("follows_rotor", _WORD),
+    ]
+
+
+class Dissection(ctypes.Structure):
+    """What is known of a capture from frame to frame."""
+
+    _fields_: ClassVar = [
+        ("room", _WORD),
+        ("datagram_count", _WORD),
+        ("datagrams", _ADDRESS),
+        ("front", _WORD),
+        ("skipped", _ADDRESS),
+        ("most_streams", _WORD),
+        ("slot_count", _WORD),
+        ("stream_count", _WORD),
+        ("streams", _ADDRESS),
+        ("stream_slots", _ADDRESS),
+        ("most_age_ns", _WORD),
+        ("most_sets", _WORD),
+        ("set_count", _WORD),
+        ("sets", _ADDRESS),
+        ("part_count", _WORD),
+        ("free_part", _WORD),
+        ("parts", _ADDRESS),
+        ("kept", _ADDRESS),
+        ("held_bytes", _WORD),
+        ("loose_bytes", _WORD),
+        ("now_ns", _WORD),
+        ("most_first", _WORD),
+        ("first_count", _WORD),
+        ("first_keys", _ADDRESS),
+        ("settled", _ADDRESS),
     ]
 
 

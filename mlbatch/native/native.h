@@ -16,7 +16,7 @@
 #endif
 
 /* To be changed with every change of a struct or of a signature. */
-#define MLBATCH_ABI 10
+#define MLBATCH_ABI 11
 
 #if defined(_WIN32)
 #define EXPORT __declspec(dllexport)
@@ -303,6 +303,64 @@ typedef struct {
     int64_t follows_rotor;
 } PacedLayout;
 
+/* Words of 8 bytes that identify a stream, and a set of fragments. */
+#define STREAM_WORDS 3
+#define KEY_WORDS 5
+
+/* A piece of a datagram that is not complete. */
+typedef struct {
+    int64_t below; /* the next part of the set, of a lower offset, or of the free ones; -1: none */
+    int64_t offset;
+    int64_t size;
+    int64_t start; /* in the data of the call, or in `kept` */
+    int64_t is_kept;
+    int64_t frame; /* of the call */
+} FragmentPart;
+
+/* The pieces of a datagram so far. */
+typedef struct {
+    uint64_t key[KEY_WORDS]; /* version << 32 | identification, source, destination */
+    int64_t birth_ns;        /* receive time of the first one */
+    int64_t frames;          /* of this capture */
+    int64_t received;        /* bytes */
+    int64_t total;           /* bytes of the datagram; -1: not known */
+    int64_t top;             /* part with the highest offset */
+    int64_t inherited;       /* number among the sets of captures before; -1: none */
+} FragmentSet;
+
+/* What is known of a capture from frame to frame. */
+typedef struct {
+    /* Datagrams found: first byte, size, stream, receive time, as columns (4, room). */
+    int64_t room;
+    int64_t datagram_count;
+    int64_t *datagrams;
+    int64_t front;    /* bytes of joined datagrams at the begin of the data */
+    int64_t *skipped; /* frames by reason */
+    /* Streams (most_streams, STREAM_WORDS) in order of their first packets: source, version << 16 |
+       port; slots (slot_count,), more than streams: numbers + 1 by hash, or 0. */
+    int64_t most_streams;
+    int64_t slot_count;
+    int64_t stream_count;
+    uint64_t *streams;
+    int64_t *stream_slots;
+    /* Open sets, oldest first. */
+    int64_t most_age_ns;
+    int64_t most_sets;
+    int64_t set_count;
+    FragmentSet *sets;
+    int64_t part_count; /* beyond them no part was used */
+    int64_t free_part;
+    FragmentPart *parts;
+    const uint8_t *kept;  /* bytes of parts of earlier calls */
+    int64_t held_bytes;   /* of all parts */
+    int64_t loose_bytes;  /* of those in the data of the call */
+    int64_t now_ns;       /* largest receive time so far */
+    int64_t most_first;
+    int64_t first_count;
+    uint64_t *first_keys; /* (most_first, KEY_WORDS): of the sets that were open first */
+    int64_t *settled;     /* what became of inherited sets, as a reason */
+} Dissection;
+
 /* Hash of a packet: `lidar/content_keys.py`. */
 static inline int64_t mlbatch_content_key(const uint8_t *packet, int64_t bytes,
                                           const uint64_t *odd)
@@ -345,14 +403,11 @@ EXPORT int64_t mlbatch_single(const uint8_t *data, int64_t packets, const int64_
 EXPORT int64_t mlbatch_walk(const uint8_t *data, int64_t begin, int64_t end, int64_t is_swapped,
                             int64_t unit_ns, int64_t most_bytes, int64_t room, int64_t *columns,
                             int64_t *stop);
-EXPORT int64_t mlbatch_dissect(const uint8_t *data, int64_t data_bytes, int64_t frames,
-                               const int64_t *start, const int64_t *captured,
-                               const int64_t *original, int64_t *datagrams, int64_t *fragments,
-                               int64_t *others, int64_t *found);
-EXPORT int64_t mlbatch_join(uint8_t *data, int64_t count, const int64_t *fragments,
-                            const int64_t *receive_ns, int64_t most_ns, int64_t set_count,
-                            int64_t room, int64_t *sets, int64_t *datagrams, int64_t *rest,
-                            int64_t *rest_count);
+EXPORT void mlbatch_dissect(Dissection *all, uint8_t *data, int64_t frames, const int64_t *start,
+                            const int64_t *captured, const int64_t *original, const int64_t *link,
+                            const int64_t *host_ns);
+EXPORT int64_t mlbatch_keep(Dissection *all, const uint8_t *data, int64_t copies_all, uint8_t *kept,
+                            int64_t used);
 EXPORT void mlbatch_copy(int64_t runs, const uint8_t *source, const int64_t *source_at,
                          const int64_t *bytes, uint8_t *target, const int64_t *target_at);
 EXPORT void mlbatch_gather(int64_t packets, const uint8_t *data, const int64_t *start,

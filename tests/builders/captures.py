@@ -117,14 +117,15 @@ def ipv6_packets(
     if mtu is None or len(datagram) + 40 <= mtu:
         return [ipv6_packet(datagram, src, dst)]
     return [
-        ipv6_packet(
-            struct.pack(">BBHI", _UDP, 0, at | more, ident) + part,
-            src,
-            dst,
-            next_header=_FRAGMENT_HEADER,
-        )
+        ipv6_piece(part, src, dst, ident=ident, offset=at, more=more)
         for at, more, part in pieces(datagram, mtu - 48)
     ]
+
+
+def ipv6_piece(part: bytes, src: str, dst: str, *, ident: int, offset: int, more: bool) -> bytes:
+    """One IPv6 packet with a fragment header."""
+    header = struct.pack(">BBHI", _UDP, 0, offset | more, ident)
+    return ipv6_packet(header + part, src, dst, next_header=_FRAGMENT_HEADER)
 
 
 def link_frame(

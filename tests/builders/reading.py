@@ -28,16 +28,12 @@ def open_capture(
     path: Path,
     *,
     buffer_bytes: int | None = None,
-    together: bool = True,
-    engine: str = "numpy",
     streams: StreamTable | None = None,
 ) -> CaptureRecording:
     """An opened capture with the buffer of a test."""
     recording = open_recording(path, streams or StreamTable())
     assert isinstance(recording, CaptureRecording)
     recording.buffer_bytes = buffer_bytes or recording.buffer_bytes
-    recording.together = together
-    recording.engine = engine
     return recording
 
 

@@ -15,9 +15,9 @@ from mlbatch.discovery import crowd
 from mlbatch.discovery.crowd import EXAMINED_AT, MOST_KINDS, Crowd
 from mlbatch.discovery.sampler import split_by_kind
 from mlbatch.discovery.types import PacketKind
-from mlbatch.readers.capture.frames import Addresses, StreamNumbers
 from mlbatch.types import MOST_STREAMS, OTHER_STREAMS, PacketBatch, Stream, StreamTable
-from tests.builders.captures import udp_frame
+from tests.builders.captures import udp_frame, write_pcap
+from tests.builders.reading import open_capture
 from tests.builders.sessions import NS_PER_MS, Shell, Unit, write_session
 
 
@@ -103,15 +103,31 @@ def test_inspect_lists_no_more_than_the_first_streams(tmp_path: Path, shell: She
     assert "10.0.0.1 > port 7502" in outcome.out
 
 
-def test_streams_beyond_the_table_are_one(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_streams_beyond_the_table_are_one(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setattr("mlbatch.types.MOST_STREAMS", 5)
+    monkeypatch.setattr("mlbatch.readers.capture.dissector.MOST_STREAMS", 5)
+    sent = [(7, 1), (7, 2), (8, 1), (8, 2), (9, 1), (7, 3), (8, 3), (9, 1), (99, 1), (7, 1)]
+    frames = [udp_frame(b"x", f"10.0.0.{low}", dport=port)[0] for low, port in sent]
+    path = write_pcap(tmp_path / "a", list(enumerate(frames)))
     table = StreamTable()
-    numbers = StreamNumbers(Addresses(), table)
-    source = np.array([7, 7, 8, 8, 9, 7, 8, 9])
-    port = np.array([1, 2, 1, 2, 1, 3, 3, 1])
-    assert numbers.numbers(source, port).tolist() == [0, 1, 2, 3, 4, 5, 5, 4]
+    # Of two frames each: all of the table is known to the second pass.
+    recording = open_capture(path, streams=table, buffer_bytes=130)
+    for _ in range(2):
+        numbers = np.concatenate([batch.stream for batch in recording.packets()])
+        assert numbers.tolist() == [0, 1, 2, 3, 4, 5, 5, 4, 5, 0]
     assert table.streams[5] == OTHER_STREAMS
-    assert numbers.numbers(np.array([99, 7, 9]), np.array([1, 1, 1])).tolist() == [5, 0, 4]
     assert table.number(Stream("10.0.0.1", 1)) == 5
     assert len(table.streams) == 6
     assert MOST_STREAMS == 65_536
+
+
+def test_streams_that_another_recording_filled_the_table_with(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setattr("mlbatch.types.MOST_STREAMS", 2)
+    table = StreamTable()
+    for number, ports in enumerate([(1, 2, 3), (3, 2, 1)]):
+        frames = [udp_frame(b"x", dport=port)[0] for port in ports]
+        path = write_pcap(tmp_path / str(number), [(0, frame) for frame in frames])
+        (batch,) = open_capture(path, streams=table).packets()
+        assert batch.stream.tolist() == [{1: 0, 2: 1, 3: 2}[port] for port in ports]

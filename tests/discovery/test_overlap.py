@@ -13,7 +13,7 @@ import pytest
 from mlbatch.discovery.overlap import LidarSpan, iso, problem
 from mlbatch.readers import open_recording
 from mlbatch.types import StreamTable
-from tests.builders.captures import write_pcap
+from tests.builders.captures import udp_frame, write_pcap
 from tests.builders.sessions import (
     EPOCH_NS,
     NS_PER_MS,
@@ -101,6 +101,16 @@ def test_the_end_of_a_capture_is_known_without_reading_it(shell: Shell, tmp_path
     late_path = _capture(tmp_path / "late.pcap", late.records)
     assert "no_overlap" not in shell("inspect", path, right).out
     assert "no_overlap" in shell("inspect", path, late_path).out
+
+
+def test_the_end_of_a_capture_of_very_many_small_packets_is_known(tmp_path: Path) -> None:
+    frames = [(number, udp_frame(b"x", dport=number % 7)[0]) for number in range(30_000)]
+    path = write_pcap(tmp_path / "small.pcap", frames)
+    last = open_recording(path, StreamTable()).last_packets(StreamTable())
+    assert last is not None
+    assert last.host_ns.tolist() == list(range(30_000 - len(last), 30_000))
+    # In 1 MiB, of 16 + 42 + 1 bytes each; the first record is only looked for.
+    assert (1 << 20) // 59 - 2 <= len(last) <= (1 << 20) // 59
 
 
 def test_a_capture_that_is_cut_off_does_not_show_its_end(tmp_path: Path) -> None:

@@ -9,7 +9,6 @@ import random
 import struct
 import tempfile
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
 
@@ -23,14 +22,20 @@ from mlbatch.decode.source import Source
 from mlbatch.lidar.content_keys import content_keys, hash_factors
 from mlbatch.lidar.geometry import rotor_words
 from mlbatch.lidar.interface import Lidar
-from mlbatch.native.capture import CaptureLoops, Found
 from mlbatch.native.library import trouble
-from mlbatch.readers.byte_records import SLACK
-from mlbatch.readers.capture.fragments import MAX_DATAGRAM_BYTES, Reassembler
-from mlbatch.readers.capture.frames import Addresses, Dissection, Fragments, Frames, dissect
+from mlbatch.readers.capture.dissector import Dissector
+from mlbatch.readers.capture.frames import Frames
 from mlbatch.ros.point_packets import CloudError, Layout, Points, layout_of, pack
 from mlbatch.ros.point_rows import Rows, take_rows
-from mlbatch.types import EXTRAS, CaptureCounts, Columns, RunInfo, SensorInfo, WindowColumns
+from mlbatch.types import (
+    EXTRAS,
+    CaptureCounts,
+    Columns,
+    RunInfo,
+    SensorInfo,
+    StreamTable,
+    WindowColumns,
+)
 from tests.builders.captures import udp_frame
 from tests.builders.engines import BOXES_M, Pair
 from tests.builders.headers import ouster_packets, same_as_numpy
@@ -53,12 +58,14 @@ from tests.decode.test_engine import (
 from tests.fuzz.harness import BrokenLaw, Target
 from tests.fuzz.mutation import Seeds, mutated
 from tests.fuzz.readers import capture_records
+from tests.reference.capture import Frame, dissect
 
 if not trouble():
     from mlbatch.ros.native_points import pack_compiled, take_rows_compiled
     from mlbatch.ros.native_rows import RowPacker
 
-_ETHERNET = 1
+# Mostly Ethernet.
+_LINKS = (1, 1, 1, 1, 1, 1, 101, 113, 276, 0)
 _PACKETS = 3
 _COLUMNS = 40
 _HEAD = struct.Struct("<I")
@@ -198,61 +205,29 @@ def _mutated_frames(rng: random.Random, seeds: Seeds) -> bytes:
     return _framed(frames)
 
 
-class _Exact(CaptureLoops):
-    """Loops over an array that ends with its last frame, so that sanitizers see what is beyond."""
-
-    def __init__(self, data: U8Array) -> None:
-        super().__init__()
-        self._data = data
-
-    def dissect(
-        self, data: U8Array, start: I64Array, captured: I64Array, original: I64Array
-    ) -> Found:
-        return super().dissect(self._data, start, captured, original)
-
-
 def _dissect(data: bytes, folder: Path) -> None:
-    """What is in frames; compiled loops read nothing beyond the last one."""
-    sizes = [len(one) for one in _frames_of(data)]
-    captured = np.array(sizes, np.int64)
-    start = captured.cumsum() - captured + _SIZE.size * np.arange(1, len(sizes) + 1)
-    exact = np.frombuffer(data, np.uint8).copy()
-    # What numpy reads beyond the last frame, as in a reader's buffer.
-    padded = np.concatenate([exact, np.zeros(SLACK, np.uint8)])
+    """The literal dissector finds the same in frames; nothing beyond the last one is read."""
+    pieces = _frames_of(data)
+    captured = np.array([len(one) for one in pieces], np.int64)
+    link = np.array([_LINKS[size % len(_LINKS)] for size in captured.tolist()], np.int64)
     original = captured + (captured % 7 == 3)
-    link = np.full(len(sizes), _ETHERNET, np.int64)
-    frames = Frames(start, captured, original, link, np.zeros(len(sizes), np.int64))
-    found = dissect(padded, frames, Addresses())
-    compiled = dissect(padded, frames, Addresses(), _Exact(exact))
-    if _content(len(data), found) != _content(len(data), compiled):
-        raise BrokenLaw("compiled loops find other datagrams than numpy")
-    if _joined(exact, found.fragments, None) != _joined(exact, found.fragments, CaptureLoops()):
-        raise BrokenLaw("compiled loops join other fragments than the rules")
-
-
-def _joined(data: U8Array, parts: Fragments, loops: CaptureLoops | None) -> object:
-    """Datagrams of fragments in an array that ends with the last of them; by the rules or loops."""
-    front = len(parts) * MAX_DATAGRAM_BYTES if loops is None else int(parts.size.sum())
-    whole = np.concatenate([np.zeros(front, np.uint8), data])
-    shifted = replace(parts, start=parts.start + front)
-    reassembler = Reassembler(CaptureCounts(), loops is not None, loops)
-    done = reassembler.push(whole, shifted, np.zeros(len(parts), np.int64))
-    reassembler.sets.finish()
-    ends = zip(done.start.tolist(), (done.start + done.size).tolist(), strict=True)
-    payloads = [whole[start:end].tobytes() for start, end in ends]
-    columns = (done.frame, done.source, done.port)
-    return payloads, [one.tolist() for one in columns], reassembler.counts.skipped
-
-
-def _content(size: int, found: Dissection) -> object:
-    datagrams, parts = found.datagrams, found.fragments
-    arrays = (
-        *(datagrams.frame, datagrams.start, datagrams.size, datagrams.source, datagrams.port),
-        *(parts.frame, parts.source, parts.destination, parts.ident, parts.offset, parts.more),
-        *(parts.start, parts.size),
-    )
-    inside = datagrams.start + datagrams.size <= size
-    return [one.tolist() for one in arrays], found.skipped, bool(inside.all())
+    host_ns = 10**9 + np.arange(len(pieces)) * 1000 - 3000 * (captured % 2)
+    front = int(captured.sum())
+    bytes_ = np.frombuffer(bytes(front) + b"".join(pieces), np.uint8).copy()
+    start = front + captured.cumsum() - captured
+    counts, streams = CaptureCounts(), StreamTable()
+    dissector = Dissector(counts, streams)
+    datagrams, _ = dissector.push(bytes_, Frames(start, captured, original, link, host_ns))
+    dissector.finish()
+    rows = zip(*(column.tolist() for column in datagrams), strict=True)
+    found = [
+        (at_ns, str(streams.streams[stream]), bytes_[at : at + size].tobytes())
+        for at, size, stream, at_ns in rows
+    ]
+    columns = (host_ns.tolist(), link.tolist(), pieces, original.tolist())
+    expected, skipped = dissect(Frame(*row) for row in zip(*columns, strict=True))
+    if (found, counts.skipped) != (expected, skipped):
+        raise BrokenLaw("compiled loops find other datagrams than the literal dissector")
 
 
 # -- clouds ---------------------------------------------------------------------------------------

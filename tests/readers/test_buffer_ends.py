@@ -19,7 +19,6 @@ from hypothesis import strategies as st
 from mcap.writer import IndexType
 
 from mlbatch.arrays import I64Array, U8Array
-from mlbatch.native.capture import CaptureLoops
 from mlbatch.readers.byte_records import SLACK
 from mlbatch.readers.capture.recording import CaptureRecording
 from mlbatch.readers.formats import mcap, pcap, pcapng, rosbag1, rosbag2
@@ -36,7 +35,6 @@ from tests.builders.captures import (
     write_pcap,
     write_pcapng,
 )
-from tests.builders.engines import needs_native
 from tests.builders.reading import Seen, assert_balanced, seen_of
 from tests.builders.rosbag1 import write_rosbag1
 from tests.builders.rosbag2 import write_rosbag2
@@ -91,14 +89,11 @@ def _write_rosbag1(path: Path, packets: Sequence[tuple[int, bytes]], compression
     write_rosbag1(path, _recorded(packets, OUSTER_ROS1, "ros1"), compression, chunk_bytes=700)
 
 
-def _capture(
-    opener: Callable[[Path, StreamTable], Recording], engine: str = "numpy"
-) -> Callable[[Path, int], Recording]:
+def _capture(opener: Callable[[Path, StreamTable], Recording]) -> Callable[[Path, int], Recording]:
     def opened(path: Path, buffer_bytes: int) -> Recording:
         recording = opener(path, StreamTable())
         assert isinstance(recording, CaptureRecording)
         recording.buffer_bytes = buffer_bytes
-        recording.engine = engine
         return recording
 
     return opened
@@ -120,10 +115,10 @@ def _mcap(form: mcaps.Form) -> Format:
     return Format(lambda path, packets: _write_mcap(path, packets, form), _open_mcap)
 
 
-def _pcap(engine: str, *, big_endian: bool = False) -> Format:
+def _pcap(*, big_endian: bool = False) -> Format:
     return Format(
         lambda path, packets: write_pcap(path, _frames(packets), big_endian=big_endian),
-        _capture(pcap.open_packets, engine),
+        _capture(pcap.open_packets),
     )
 
 
@@ -139,9 +134,8 @@ def _rosbag1(compression: str) -> Format:
 
 
 FORMATS = {
-    "pcap": _pcap("numpy"),
-    "pcap, big endian": _pcap("numpy", big_endian=True),
-    "pcap, compiled": _pcap("native"),
+    "pcap": _pcap(),
+    "pcap, big endian": _pcap(big_endian=True),
     "pcapng": _pcapng(),
     "pcapng, big endian": _pcapng(big_endian=True),
     "MCAP": _mcap(mcaps.Form(chunk_bytes=700)),
@@ -155,10 +149,7 @@ FORMATS = {
         _open_rosbag2,
     ),
 }
-_COMPILED = {"pcap, compiled"}
-_EACH = pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=[needs_native] * (name in _COMPILED)) for name in FORMATS]
-)
+_EACH = pytest.mark.parametrize("name", FORMATS)
 
 
 def packets_of(rows: Sequence[tuple[int, int]]) -> list[tuple[int, bytes]]:
@@ -202,11 +193,9 @@ def test_the_first_buffer_may_end_at_every_byte(tmp_path: Path, name: str) -> No
 
 
 @pytest.mark.parametrize("big_endian", [False, True])
-@pytest.mark.parametrize("engine", ["numpy", pytest.param("native", marks=needs_native)])
 def test_rows_of_any_length_end_at_every_byte_of_the_frames_around(
-    tmp_path: Path, engine: str, big_endian: bool
+    tmp_path: Path, big_endian: bool
 ) -> None:
-    loops = CaptureLoops() if engine == "native" else None
     pick = random.Random(1)
     path = tmp_path / "a.pcap"
     for length in range(1, 201):
@@ -217,7 +206,7 @@ def test_rows_of_any_length_end_at_every_byte_of_the_frames_around(
         assert isinstance(recording, CaptureRecording)
         sizes = [len(payload) + _ETHERNET_HEADERS + _RECORD_BYTES for _, payload in packets]
         after = np.cumsum([_FILE_HEADER_BYTES, *sizes])
-        file = _File(recording, loops, np.frombuffer(content + bytes(SLACK), np.uint8), after)
+        file = _File(recording, np.frombuffer(content + bytes(SLACK), np.uint8), after)
         # Around the 17th equal frame of the row, and around its last.
         cuts = [
             cut
@@ -233,13 +222,12 @@ class _File:
     """A capture with one buffer end; after: ends of its header and of each record."""
 
     recording: CaptureRecording
-    loops: CaptureLoops | None
     data: U8Array
     after: I64Array
 
     def check(self, cut: int, host_ns: list[int]) -> None:
         """A walk over the bytes before `cut`, and one over the rest, find all frames."""
-        walker = self.recording.walker(self.loops)
+        walker = self.recording.walker()
         whole = int(np.searchsorted(self.after[1:], cut, side="right"))
         front = walker.walk(self.data[: cut + SLACK], 0, cut)
         assert len(front.frames) == whole

@@ -8,27 +8,24 @@ or that claims an impossible length; reading ends there and `notes` say where.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Generator, Iterator, Mapping
+from collections.abc import Callable, Generator, Iterator
 from dataclasses import dataclass, field
-from typing import Protocol, TypeAlias
+from typing import Protocol
 
 import numpy as np
 
 from mlbatch.arrays import I64Array, U8Array
 from mlbatch.errors import RecordingError
 from mlbatch.native.arena import PacketArena
-from mlbatch.native.capture import CaptureLoops
 from mlbatch.readers.byte_records import SLACK
-from mlbatch.readers.capture import link_types
-from mlbatch.readers.capture.fragments import (
+from mlbatch.readers.capture.dissector import (
     MAX_AGE_NS,
     MAX_DATAGRAM_BYTES,
-    FragmentSet,
+    Dissector,
     Key,
-    Reassembler,
-    SetTable,
+    OpenSet,
 )
-from mlbatch.readers.capture.frames import Addresses, Frames, StreamNumbers, dissect, in_order
+from mlbatch.readers.capture.frames import LINKS, Frames, unknown_link
 from mlbatch.readers.source import BUFFER_BYTES, Source, Window
 from mlbatch.types import (
     MAX_OVERLAP_NS,
@@ -73,53 +70,16 @@ class Walker(Protocol):
         ...
 
 
-# Addresses and identification of a set, as they are in every capture.
-PackedKey: TypeAlias = tuple[bytes, bytes, int]
-
-
-@dataclass(slots=True)
-class PassFragments:
-    """Open fragments of a pass over a capture; begin_ns, end_ns: receive times of its frames."""
-
-    sets: SetTable
-    addresses: Addresses
-    begin_ns: int | None = None
-    end_ns: int = 0
-
-    def span(self, host_ns: I64Array) -> None:
-        """Note the receive times (n,) of the next frames."""
-        if len(host_ns) and self.begin_ns is None:
-            self.begin_ns = int(host_ns[0])
-        self.end_ns = int(host_ns.max(initial=self.end_ns))
-
-    def packed(self, key: Key) -> PackedKey:
-        """Name of a set of this pass in any other one."""
-        source, destination, ident = key
-        return self.addresses.packed(source), self.addresses.packed(destination), ident
-
-    def take_over(self, sets: Mapping[PackedKey, FragmentSet], now_ns: int) -> None:
-        """Begin with sets of other captures."""
-        if not sets:
-            return
-        numbered = {
-            (self.addresses.number(source), self.addresses.number(destination), ident): held
-            for (source, destination, ident), held in sets.items()
-        }
-        self.sets.take_over(numbered, now_ns)
-
-
 @dataclass(slots=True)
 class CaptureRecording(Recording):
     """A capture file.
 
-    walker: makes the Walker of a pass, with compiled loops or None. For tests: buffer_bytes, and
-    together (False: fragments one at a time). Results do not depend on them.
+    walker: makes the Walker of a pass; buffer_bytes: for tests, results do not depend on it.
     """
 
-    walker: Callable[[CaptureLoops | None], Walker]
+    walker: Callable[[], Walker]
     streams: StreamTable
     buffer_bytes: int = BUFFER_BYTES
-    together: bool = True
     # Of the next pass; None: each buffer is used again.
     arena: PacketArena | None = None
     # Start of the first record in the last bytes of a file (True: all its records), and bytes of
@@ -127,15 +87,15 @@ class CaptureRecording(Recording):
     first_record: Callable[[U8Array, bool], int | None] | None = None
     head_bytes: int = 0
     # Of the newest pass, and sets of captures before this one for the next.
-    fragments: PassFragments | None = None
-    inherited: dict[PackedKey, FragmentSet] = field(default_factory=dict)
+    dissector: Dissector | None = None
+    inherited: dict[Key, OpenSet] = field(default_factory=dict)
     inherited_ns: int = 0
 
     @property
     def fragments_begin_ns(self) -> int | None:
         """Receive time of the first frame of the newest pass, if it left datagrams open."""
-        fragments = self.fragments
-        return fragments.begin_ns if fragments is not None and fragments.sets.first_keys else None
+        dissector = self.dissector
+        return dissector.begin_ns if dissector is not None and dissector.first_keys else None
 
     def follow(self, earlier: Recording) -> None:
         """Take over what `earlier` left open for the next pass, if this capture continues it.
@@ -145,21 +105,19 @@ class CaptureRecording(Recording):
         begin_ns = self.fragments_begin_ns
         if not isinstance(earlier, CaptureRecording) or begin_ns is None:
             return
-        mine = self.fragments
-        theirs = earlier.fragments
+        mine = self.dissector
+        theirs = earlier.dissector
         if mine is None or theirs is None:
             return
         pause_ns = begin_ns - theirs.end_ns
         if pause_ns > MAX_AGE_NS:
-            theirs.sets.forget()
+            theirs.open_sets.clear()
         if pause_ns < -MAX_OVERLAP_NS:
             return
-        first = {mine.packed(key) for key in mine.sets.first_keys} - self.inherited.keys()
-        for key in theirs.sets.open_keys():
-            name = theirs.packed(key)
-            if name in first:
-                self.inherited[name] = theirs.sets.hand_over(key)
-                self.inherited_ns = max(self.inherited_ns, theirs.sets.now_ns)
+        expected = mine.first_keys - self.inherited.keys()
+        for key in [key for key in theirs.open_sets if key in expected]:
+            self.inherited[key] = theirs.hand_over(key)
+            self.inherited_ns = max(self.inherited_ns, theirs.now_ns)
 
     def last_packets(self, streams: StreamTable) -> PacketBatch | None:
         """Return packets in the last bytes; None for compressed files and unknown records."""
@@ -178,12 +136,16 @@ class CaptureRecording(Recording):
         data = np.zeros(end + SLACK, np.uint8)
         data[: len(head)] = np.frombuffer(head, np.uint8)
         data[len(head) : end] = tail[begin:]
-        frames = self.walker(None).walk(data, 0, end).frames
-        addresses = Addresses()
-        datagrams = dissect(data, frames, addresses).datagrams
-        stream = StreamNumbers(addresses, streams).numbers(datagrams.source, datagrams.port)
-        host_ns = frames.host_ns[datagrams.frame]
-        return PacketBatch(data, datagrams.start, datagrams.size, stream, host_ns)
+        # Fragments may have begun before.
+        dissector = Dissector(CaptureCounts(), streams, max_age_ns=-1)
+        walker = self.walker()
+        walk = Walk(0)
+        found = []
+        while walk.next < end and not walk.need and not walk.fault:
+            walk = walker.walk(data, walk.next, end)
+            found.append(dissector.push(data, walk.frames)[0])
+        start, size, stream, host_ns = map(np.concatenate, zip(*found, strict=True))
+        return PacketBatch(data, start, size, stream, host_ns)
 
     def use_arena(self, arena: PacketArena) -> bool:
         """Read the next pass into an arena."""
@@ -197,15 +159,16 @@ class CaptureRecording(Recording):
         self.position_bytes = 0
         current = _Pass(self)
         self.arena = None
-        self.fragments = current.fragments
-        self.fragments.take_over(self.inherited, self.inherited_ns)
+        self.dissector = current.dissector
+        if self.inherited:
+            self.dissector.inherit(self.inherited, self.inherited_ns)
         self.inherited = {}
         self.inherited_ns = 0
         try:
             with Source(self.path) as source:
                 yield from current.batches(source)
         finally:
-            self.fragments.sets.finish()
+            self.dissector.finish()
         current.check_links()
 
 
@@ -214,12 +177,8 @@ class _Pass:
 
     def __init__(self, recording: CaptureRecording) -> None:
         self.recording = recording
-        self.loops = CaptureLoops() if recording.engine == "native" else None
-        self.walker = recording.walker(self.loops)
-        self.addresses = Addresses()
-        self.numbers = StreamNumbers(self.addresses, recording.streams)
-        self.reassembler = Reassembler(recording.counts, recording.together, self.loops)
-        self.fragments = PassFragments(self.reassembler.sets, self.addresses)
+        self.walker = recording.walker()
+        self.dissector = Dissector(recording.counts, recording.streams)
         self.arena = recording.arena
         read_bytes = 0 if self.arena is None else self.arena.read_bytes
         self.buffer_bytes = read_bytes or recording.buffer_bytes
@@ -255,7 +214,7 @@ class _Pass:
 
         The second is True for the last portion. spanned_bytes: of the records of all frames.
         """
-        if len(frames) and self.reassembler.sets.held_bytes + spanned_bytes <= self.front_bytes:
+        if len(frames) and self.dissector.held_bytes + spanned_bytes <= self.front_bytes:
             # The usual case.
             yield frames, True
             return
@@ -264,7 +223,7 @@ class _Pass:
         at = 0
         while at < len(frames):
             before = int(end_bytes[at - 1]) if at else 0
-            room = self.front_bytes - self.reassembler.sets.held_bytes + before
+            room = self.front_bytes - self.dissector.held_bytes + before
             stop = max(int(np.searchsorted(end_bytes, room, side="right")), at + fewest)
             yield frames.take(slice(at, stop)), stop >= len(frames)
             at = stop
@@ -274,37 +233,22 @@ class _Pass:
 
         is_last: no other batch is assembled in the same bytes.
         """
-        data = window.data
-        place = window.arena_place
         self._note_links(frames.link)
-        self.fragments.span(frames.host_ns)
-        found = dissect(data, frames, self.addresses, self.loops)
-        counts = self.recording.counts
-        counts.frames += len(frames)
-        for reason, count in found.skipped.items():
-            counts.skip(reason, count)
-        datagrams = found.datagrams
-        if len(found.fragments):
-            receive_ns = frames.host_ns[found.fragments.frame]
-            assembled = self.reassembler.push(data, found.fragments, receive_ns)
-            datagrams = in_order(datagrams, assembled)
-            place = place if is_last else None
-        counts.datagrams += len(datagrams.frame)
-        stream = self.numbers.numbers(datagrams.source, datagrams.port)
-        host_ns = frames.host_ns[datagrams.frame]
-        return PacketBatch(data, datagrams.start, datagrams.size, stream, host_ns, place=place)
+        datagrams, joined_bytes = self.dissector.push(window.data, frames)
+        place = window.arena_place if is_last or not joined_bytes else None
+        return PacketBatch(window.data, *datagrams, place=place)
 
     def _note_links(self, link: I64Array) -> None:
         if not self.has_known_link:
             numbers = sorted(set(link.tolist()))
-            unknown = [number for number in numbers if number not in link_types.LINKS]
+            unknown = [number for number in numbers if number not in LINKS]
             self.has_known_link = len(unknown) < len(numbers)
             self.unknown_link = unknown[0] if unknown else self.unknown_link
 
     def check_links(self) -> None:
         """Raise if no frame of the capture was of a known link type."""
         if not self.has_known_link and self.unknown_link is not None:
-            why = link_types.unknown_link(self.unknown_link)
+            why = unknown_link(self.unknown_link)
             raise RecordingError(f"{self.recording.path}: {why}")
 
     def _end(self, window: Window, walk: Walk, source: Source) -> None:

@@ -11,12 +11,10 @@ from pathlib import Path
 
 import numpy as np
 
-from mlbatch.arrays import I64Array, U8Array, U32Array
+from mlbatch.arrays import U8Array
 from mlbatch.errors import RecordingError
 from mlbatch.native.capture import NO_ROOM, TOO_LONG, CaptureLoops
-from mlbatch.readers.byte_records import records
-from mlbatch.readers.capture import link_types
-from mlbatch.readers.capture.frames import Frames
+from mlbatch.readers.capture.frames import LINKS, Frames, unknown_link
 from mlbatch.readers.capture.recording import MAX_FRAME_BYTES, CaptureRecording, Walk
 from mlbatch.readers.source import read_head
 from mlbatch.types import Recording, StreamTable
@@ -40,8 +38,6 @@ _LENGTH_AT = 8
 _ZEROS = "expected a record, found zeros"
 # Shorter than the headers of any UDP packet.
 _LEAST_FRAME = 14
-# After this many frames of one length in a row, more are likely.
-_ALIKE = 16
 
 
 def recognises(head: bytes) -> bool:
@@ -70,8 +66,8 @@ def open_packets(path: Path, streams: StreamTable) -> Recording:
         )
     order, unit_ns = _MAGIC[head[:4]]
     link = struct.unpack_from(order + "I", head, _LINK_AT)[0] & 0xFFFF
-    if link not in link_types.LINKS:
-        raise RecordingError(f"{path}: {link_types.unknown_link(link)}")
+    if link not in LINKS:
+        raise RecordingError(f"{path}: {unknown_link(link)}")
     walker = partial(_Walker, order, unit_ns, link)
     return CaptureRecording(
         path,
@@ -119,102 +115,38 @@ def _first_record(order: str, unit_ns: int, tail: U8Array, is_all: bool) -> int 
 class _Walker:
     """Steps from record to record."""
 
-    def __init__(
-        self, order: str, unit_ns: int, link: int, loops: CaptureLoops | None = None
-    ) -> None:
-        names = ("seconds", "fraction", "captured", "original")
-        self.layout = np.dtype([(name, order + "u4") for name in names])
+    def __init__(self, order: str, unit_ns: int, link: int) -> None:
         self.length = struct.Struct(order + "I")
         self.unit_ns = unit_ns
         self.link = link
-        self.loops = loops
+        self.loops = CaptureLoops()
         self.is_swapped = order == ">"
         self.skip = _FILE_HEADER_BYTES
 
     def walk(self, data: U8Array, begin: int, end: int) -> Walk:
-        """The frames in `data[begin:end]`, as far as their records are complete."""
+        """The frames in `data[begin:end]`, as far as their records are complete.
+
+        At most as many frames as the loops have room for.
+        """
         begin += self.skip
         self.skip = 0
-        if self.loops is None:
-            return _up_to_zeros(self._walk(data, begin, end))
-        return _up_to_zeros(self._walk_by(self.loops, data, begin, end))
-
-    def _walk(self, data: U8Array, begin: int, end: int) -> Walk:
-        """The same without compiled loops."""
-        starts = self._starts(data, begin, end)
-        record = records(data, self.layout, starts)
-        captured = record["captured"].astype(np.int64)
-        after = starts + _RECORD_BYTES + captured
-        too_long = np.flatnonzero(captured > MAX_FRAME_BYTES)
-        count = (
-            int(too_long[0]) if len(too_long) else int(np.searchsorted(after, end, side="right"))
-        )
-        frames = Frames(
-            start=starts[:count] + _RECORD_BYTES,
-            captured=captured[:count],
-            original=record["original"][:count].astype(np.int64),
-            link=np.full(count, self.link, np.int64),
-            host_ns=record["seconds"][:count].astype(np.int64) * NS_PER_S
-            + record["fraction"][:count].astype(np.int64) * self.unit_ns,
-        )
-        place = int(after[count - 1]) if count else begin
-        if len(too_long):
-            return Walk(place, fault=_too_long(int(captured[count])), frames=frames)
-        more = int(captured[count]) if count < len(starts) else 0
-        return Walk(place, _RECORD_BYTES + more, frames=frames)
-
-    def _walk_by(self, loops: CaptureLoops, data: U8Array, begin: int, end: int) -> Walk:
-        """The frames by compiled loops; at most as many frames as they have room for."""
-        records, place, why = loops.walk(
+        records, place, why = self.loops.walk(
             data, begin, end, self.is_swapped, self.unit_ns, MAX_FRAME_BYTES
         )
         start, captured, original, host_ns = records
         link = np.full(len(start), self.link, np.int64)
         frames = Frames(start, captured, original, link, host_ns)
-        if why == NO_ROOM:
-            return Walk(place, frames=frames)
         more = 0
         if place <= end - _RECORD_BYTES:
             more = self.length.unpack_from(data.data, place + _LENGTH_AT)[0]
-        if why == TOO_LONG:
-            return Walk(place, fault=_too_long(more), frames=frames)
-        return Walk(place, _RECORD_BYTES + more, frames=frames)
-
-    def _starts(self, data: U8Array, begin: int, end: int) -> I64Array:
-        """Places of records with complete headers; the last one's frame may be cut off."""
-        view = data.data
-        length_at = self.length.unpack_from
-        parts: list[I64Array] = []
-        starts: list[int] = []
-        at = begin
-        before = -1
-        alike = 0
-        while at <= end - _RECORD_BYTES:
-            starts.append(at)
-            length = length_at(view, at + _LENGTH_AT)[0]
-            alike = alike + 1 if length == before else 0
-            before = length
-            at += _RECORD_BYTES + length
-            if alike >= _ALIKE:
-                run = self._alike(data, at, end, length)
-                parts += [np.array(starts, np.int64), run]
-                at += len(run) * (_RECORD_BYTES + length)
-                starts = []
-                alike = 0
-        return np.concatenate([*parts, np.array(starts, np.int64)])
-
-    def _alike(self, data: U8Array, begin: int, end: int, length: int) -> I64Array:
-        """Places of the next records as long as their frames have this length; none to many."""
-        step = _RECORD_BYTES + length
-        if begin > end - _RECORD_BYTES:
-            # The last record ends behind the buffer, perhaps behind its array as well.
-            return np.zeros(0, np.int64)
-        count = (end - _RECORD_BYTES - begin) // step + 1
-        at = begin + _LENGTH_AT
-        lengths: U32Array = np.ndarray(count, self.layout["captured"], data.data, at, (step,))
-        others = (lengths != length).nonzero()[0]
-        run = int(others[0]) if len(others) else count
-        return begin + step * np.arange(run)
+        if why == NO_ROOM:
+            walk = Walk(place, frames=frames)
+        elif why == TOO_LONG:
+            fault = f"expected a frame of at most {MAX_FRAME_BYTES} bytes, found {more}"
+            walk = Walk(place, fault=fault, frames=frames)
+        else:
+            walk = Walk(place, _RECORD_BYTES + more, frames=frames)
+        return _up_to_zeros(walk)
 
 
 def _up_to_zeros(walk: Walk) -> Walk:
@@ -229,7 +161,3 @@ def _up_to_zeros(walk: Walk) -> Walk:
     first = int(rows[0])
     place = int(frames.start[first]) - _RECORD_BYTES
     return Walk(place, fault=_ZEROS, frames=frames.take(slice(0, first)))
-
-
-def _too_long(size: int) -> str:
-    return f"expected a frame of at most {MAX_FRAME_BYTES} bytes, found {size}"

@@ -16,8 +16,7 @@ import numpy.typing as npt
 
 from mlbatch.arrays import I64Array, U8Array
 from mlbatch.readers.byte_records import records
-from mlbatch.readers.capture.frames import Frames
-from mlbatch.readers.capture.link_types import NO_LINK
+from mlbatch.readers.capture.frames import NO_LINK, Frames
 from mlbatch.readers.capture.recording import MAX_BLOCK_BYTES, CaptureRecording, Walk
 from mlbatch.readers.source import read_head
 from mlbatch.types import Recording, StreamTable
@@ -64,7 +63,7 @@ def open_packets(path: Path, streams: StreamTable) -> Recording:
     """Open a pcapng file; its payloads come from streams (source IP, destination port)."""
     read_head(path)
     size_bytes = path.stat().st_size
-    return CaptureRecording(path, CONTAINER, size_bytes, lambda _: _Walker(), streams)
+    return CaptureRecording(path, CONTAINER, size_bytes, _Walker, streams)
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,23 +1,25 @@
-"""Reassembly: the rules one by one, and that the fast way keeps to them."""
+"""Reassembly: the rules one by one, and the literal reassembler on any traffic."""
 
 from __future__ import annotations
 
 import random
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from unittest import mock
 
-import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mlbatch.native.capture import CaptureLoops
-from mlbatch.native.library import trouble
-from mlbatch.readers.capture import fragments as _fragments
-from tests.builders.captures import ipv4_packet, link_frame, udp_frame, write_pcap
-from tests.builders.engines import ENGINES, needs_native
+from mlbatch.readers.capture import dissector
+from tests.builders.captures import (
+    ipv4_packet,
+    ipv6_piece,
+    link_frame,
+    udp_frame,
+    write_pcap,
+)
 from tests.builders.reading import Seen, open_capture, read
+from tests.reference.capture import dissect, pcap_frames
 
 SECOND_NS = 1_000_000_000
 MTU = 576  # 552 bytes of data a fragment
@@ -34,31 +36,29 @@ def fragments(seed: int, ident: int = 1, src: str = "10.0.0.1", size: int = 1500
     return udp_frame(payload(seed, size), src, ident=ident, mtu=MTU)
 
 
-def every_way(
-    records: Records, buffer_bytes: int | None = None
+def seen_and_skipped(
+    records: Records, buffer_bytes: int | None = None, max_sets: int = dissector.MAX_SETS
 ) -> tuple[list[Seen], dict[str, int]]:
-    """Packets and skipped frames, which must be the same by the rules and in all fast ways."""
+    """Packets and skipped frames, which must be those of the literal reassembler."""
     with TemporaryDirectory() as folder:
         path = write_pcap(Path(folder) / "a", records)
-        slow = open_capture(path, together=False)
-        seen = read(slow)
-        for engine in ("numpy",) if trouble() else ENGINES:
-            fast = open_capture(path, buffer_bytes=buffer_bytes, engine=engine)
-            assert read(fast) == seen
-            assert fast.counts == slow.counts
-            assert fast.streams.streams == slow.streams.streams
-        return seen, slow.counts.skipped
+        expected, lost = dissect(pcap_frames(path.read_bytes()), max_sets)
+        recording = open_capture(path, buffer_bytes=buffer_bytes)
+        seen = read(recording)
+        assert [(one.host_ns, one.stream, one.payload) for one in seen] == expected
+        assert recording.counts.skipped == lost
+        return seen, lost
 
 
 def found(frames: list[bytes]) -> tuple[list[bytes], dict[str, int]]:
     """Payloads and skipped frames of frames received 1 us apart."""
-    seen, skipped = every_way([(i * 1000, frame) for i, frame in enumerate(frames)])
+    seen, skipped = seen_and_skipped([(i * 1000, frame) for i, frame in enumerate(frames)])
     return [one.payload for one in seen], skipped
 
 
 def test_the_completing_fragment_gives_the_time() -> None:
     first, middle, last = fragments(1)
-    seen, skipped = every_way([(10, first), (30, last), (70, middle)])
+    seen, skipped = seen_and_skipped([(10, first), (30, last), (70, middle)])
     assert seen == [Seen(70, "10.0.0.1 > port 7502", payload(1))]
     assert skipped == {"fragment": 2}
 
@@ -108,14 +108,16 @@ def test_a_lost_fragment_loses_its_datagram_only() -> None:
 @pytest.mark.parametrize(("age_ns", "whole"), [(SECOND_NS, True), (SECOND_NS + 1, False)])
 def test_sets_older_than_a_second_are_dropped(age_ns: int, whole: bool) -> None:
     first, middle, last = fragments(1)
-    seen, skipped = every_way([(5, first), (5 + age_ns, middle), (5 + age_ns, last)])
+    seen, skipped = seen_and_skipped([(5, first), (5 + age_ns, middle), (5 + age_ns, last)])
     assert len(seen) == whole
     assert skipped == ({"fragment": 2} if whole else {"fragment_lost": 3})
 
 
 def test_age_counts_when_the_clock_steps_back() -> None:
     first, middle, last = fragments(1)
-    seen, skipped = every_way([(5 * SECOND_NS, first), (SECOND_NS, middle), (SECOND_NS, last)])
+    seen, skipped = seen_and_skipped(
+        [(5 * SECOND_NS, first), (SECOND_NS, middle), (SECOND_NS, last)]
+    )
     assert (seen, skipped) == ([], {"fragment_lost": 3})
 
 
@@ -172,14 +174,13 @@ def test_ipv6_fragments_interleave_with_ipv4() -> None:
 
 
 def test_open_sets_are_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(_fragments, "MAX_SETS", 3)
-    monkeypatch.setattr("mlbatch.readers.capture.fragments.MAX_SETS", 3)
+    monkeypatch.setattr(dissector, "MAX_SETS", 3)
     sets = [fragments(i, ident=i) for i in range(5)]
     frames = [one[0] for one in sets] + [frame for one in sets for frame in one[1:]]
-    payloads, skipped = found(frames)
+    seen, skipped = seen_and_skipped([(0, frame) for frame in frames], max_sets=3)
     # The first fragments of sets 3 and 4 drop sets 0 and 1; their further fragments open sets
     # again and drop 2, 3 and 4 one by one.
-    assert payloads == []
+    assert seen == []
     assert skipped == {"fragment_lost": 15}
 
 
@@ -187,7 +188,7 @@ def test_large_held_sets_do_not_overflow_the_arena() -> None:
     # 60 datagrams of 60 kB each wait for their last fragments, which come all at once.
     sets = [udp_frame(payload(i, 60_000), ident=i, mtu=9000) for i in range(60)]
     frames = [f for one in sets for f in one[:-1]] + [one[-1] for one in sets]
-    seen, skipped = every_way([(0, f) for f in frames], buffer_bytes=50_000)
+    seen, skipped = seen_and_skipped([(0, f) for f in frames], buffer_bytes=50_000)
     assert [one.payload for one in seen] == [payload(i, 60_000) for i in range(60)]
     assert skipped == {"fragment": 6 * 60}
 
@@ -224,56 +225,53 @@ def feed(seed: int) -> Records:
 @given(
     seed=st.integers(0, 2**32),
     buffer_bytes=st.sampled_from([100, 1000, 2000, 5000, 20_000, 100_000]),
-    few=st.sampled_from([1, 64]),
 )
-def test_the_fast_ways_and_any_buffer_give_what_the_rules_give(
-    seed: int, buffer_bytes: int, few: int
+def test_any_traffic_through_any_buffer_is_joined_by_the_rules(
+    seed: int, buffer_bytes: int
 ) -> None:
-    with mock.patch.object(_fragments, "_FEW", few):
-        every_way(feed(seed), buffer_bytes)
+    seen_and_skipped(feed(seed), buffer_bytes)
 
 
-@pytest.mark.parametrize("engine", ENGINES)
-@pytest.mark.parametrize("back_ns", [0, 2000])
-def test_times_that_step_back_cost_no_fragment_a_call(
-    engine: str, back_ns: int, tmp_path: Path
+@settings(max_examples=300)
+@given(
+    pieces=st.lists(
+        st.tuples(
+            st.integers(1, 2),
+            st.sampled_from(["10.0.0.1", "10.0.0.2", "fe80::1"]),
+            st.integers(0, 5),
+            st.integers(1, 3),
+            st.booleans(),
+            st.booleans(),
+        ),
+        max_size=60,
+    ),
+    buffer_bytes=st.sampled_from([100, 300, 4096]),
+)
+def test_pieces_of_any_place_and_size_are_joined_by_the_rules(
+    pieces: list[tuple[int, str, int, int, bool, bool]], buffer_bytes: int
 ) -> None:
-    """Several queues of a network card: every fifth frame is stamped 2 us earlier."""
-    if engine == "native" and trouble():
-        pytest.skip("no compiled loops")
-    frames = [frame for i in range(100) for frame in fragments(i, ident=i)]
-    records = [(10_000 + 1000 * i - (i % 5 == 0) * back_ns, f) for i, f in enumerate(frames)]
-    recording = open_capture(write_pcap(tmp_path / "a", records), engine=engine)
-    with mock.patch.object(_fragments.SetTable, "add", side_effect=AssertionError):
-        assert [one.payload for one in read(recording)] == [payload(i) for i in range(100)]
+    """Overlaps, gaps, repeats and several ends of few datagrams, in any order."""
+    content = (7).to_bytes(2, "big") * 2 + (40).to_bytes(2, "big") + bytes(range(6, 80))
+    records = []
+    for number, (ident, source, unit, units, more, differs) in enumerate(pieces):
+        data = bytearray(content[8 * unit : 8 * (unit + units)])
+        data[-1] += differs
+        six = ":" in source
+        build, target = (ipv6_piece, "fe80::2") if six else (ipv4_packet, "10.0.0.9")
+        packet = build(bytes(data), source, target, ident=ident, offset=8 * unit, more=more)
+        frame = link_frame(packet, version=6 if six else 4)
+        records.append((number * 1000 - (number % 5 == 0) * 2000 + 10_000, frame))
+    seen_and_skipped(records, buffer_bytes)
 
 
-@needs_native
-def test_frames_that_follow_each_other_are_joined_in_place() -> None:
-    # Sets 7, 8 and 9, of which 9 is open; between frames 2 and 4 is one without a fragment.
-    first = [(0, 0, 8), (1, 8, 8), (2, 16, 4)]
-    parts = [(7, frame, at, size, frame != 2) for frame, at, size in first]
-    parts += [(8, 4, 0, 10, True), (8, 5, 10, 6, False), (9, 8, 16, 8, False)]
-    data = np.random.default_rng(1).integers(0, 256, 240, np.uint8)
-    start = np.array([10, 50, 80, 120, 150, 200])
-    # Source and destination port, length, checksum.
-    data[10:18] = list(bytes.fromhex("00011d4e00140000"))
-    data[120:128] = list(bytes.fromhex("00021d4f000c0000"))
-    before = data.copy()
-    ident, frame, offset, size, more = (np.array(column) for column in zip(*parts, strict=True))
-    fragments = np.array([frame, 0 * frame + 3, 0 * frame + 4, ident, offset, more, start, size])
-    times = np.arange(len(parts))
-    datagrams, rest = CaptureLoops().join(data, fragments, times, SECOND_NS, [(3, 4, 9)])
-    assert datagrams.T.tolist() == [[2, 18, 12, 3, 7502], [5, 128, 4, 3, 7503]]
-    assert rest.tolist() == [5]
-    assert data[18:30].tolist() == [*before[50:58].tolist(), *before[80:84].tolist()]
-    assert data[128:132].tolist() == [*before[128:130].tolist(), *before[150:152].tolist()]
-    assert data[200:].tolist() == before[200:].tolist()
-
-
-@needs_native
-@pytest.mark.parametrize(("start", "size"), [(-1, 8), (93, 8), (0, -1), (2**62, 8), (0, 2**62)])
-def test_fragments_beyond_the_buffer_are_refused(start: int, size: int) -> None:
-    fragments = np.array([[0], [1], [2], [3], [0], [0], [start], [size]])
-    with pytest.raises(IndexError):
-        CaptureLoops().join(np.zeros(100, np.uint8), fragments, np.zeros(1, np.int64), 1, [])
+def test_parts_that_wait_are_few_bytes_again() -> None:
+    """Every datagram but the last of a window waits for a fragment that comes a window later."""
+    late: list[bytes] = []
+    frames: list[bytes] = []
+    for i in range(300):
+        *first, last = fragments(i, ident=i)
+        frames += first + late[-20:-19]
+        late.append(last)
+    seen, skipped = seen_and_skipped([(0, f) for f in frames], buffer_bytes=3000)
+    assert [one.payload for one in seen] == [payload(i) for i in range(280)]
+    assert skipped == {"fragment": 2 * 280, "fragment_lost": 2 * 20}

@@ -1,82 +1,223 @@
-"""The content of a frame does not depend on its neighbours; usual frames have a fast path."""
+"""Frames of every kind: the same payloads, reasons and order as by the literal dissector."""
 
 from __future__ import annotations
 
+import random
 import struct
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
-from mlbatch.readers.byte_records import SLACK
-from mlbatch.readers.capture.frames import Addresses, Frames, dissect
+from mlbatch.readers.capture import frames as _frames
+from mlbatch.readers.capture.dissector import MAX_DATAGRAM_BYTES, Dissector
+from mlbatch.readers.capture.frames import Frames
+from mlbatch.types import CaptureCounts, StreamTable
+from tests.builders.captures import ipv4_packet, ipv6_packet, link_frame, udp_frame
+from tests.reference import capture as reference
+from tests.reference.capture import Frame, dissect
 
 _PAYLOAD = bytes(range(100, 110))
-# Ethernet (no tag), IPv4 of five words, UDP from port 5000 to 7502, ten bytes; RFC 791 and 768.
-_UDP = struct.pack(">HHHH", 5000, 7502, 8 + len(_PAYLOAD), 0) + _PAYLOAD
-_IP = struct.pack(">BBHHHBBHII", 0x45, 0, 20 + len(_UDP), 7, 0, 64, 17, 0, 0x0A000001, 0x0A000002)
-_USUAL = bytes(12) + b"\x08\x00" + _IP + _UDP
-_ARP = bytes(12) + b"\x08\x06" + bytes(28)
 _ETHERNET = 1
+LINKS = (*reference.TYPED_LINKS, *reference.FAMILY_LINKS, *reference.RAW_LINKS)
 
 
-def content(frames: list[bytes], cut: int = 0, link: int = _ETHERNET) -> list[object]:
-    """Content of the first of some frames; cut: bytes that the capture left out of it."""
-    sizes = np.array([len(frame) for frame in frames])
-    data = np.frombuffer(b"".join(frames) + bytes(SLACK), np.uint8)
-    captured = sizes.copy()
-    captured[0] -= cut
-    start = np.cumsum(sizes) - sizes
-    links = np.full(len(frames), _ETHERNET)
-    links[0] = link
-    found = dissect(data, Frames(start, captured, sizes, links, np.zeros_like(start)), Addresses())
-    datagrams, fragments = found.datagrams, found.fragments
-    whole = [
-        (int(s), int(n), int(a), int(p))
-        for f, s, n, a, p in zip(
-            datagrams.frame,
-            datagrams.start,
-            datagrams.size,
-            datagrams.source,
-            datagrams.port,
-            strict=True,
+def found(frames: list[Frame], portions: int = 1) -> list[object]:
+    """Payloads and skipped frames, in so many calls; the frames end with their array."""
+    counts, streams = CaptureCounts(), StreamTable()
+    dissector = Dissector(counts, streams)
+    seen = []
+    for number in range(portions):
+        some = frames[number * len(frames) // portions : (number + 1) * len(frames) // portions]
+        captured = np.array([len(one.data) for one in some], np.int64)
+        front = len(some) * MAX_DATAGRAM_BYTES
+        data = np.zeros(front + int(captured.sum()), np.uint8)
+        data[front:] = np.frombuffer(b"".join(one.data for one in some), np.uint8)
+        original, link, host_ns = (
+            np.array([getattr(one, name) for one in some], np.int64)
+            for name in ("original", "link", "host_ns")
         )
-        if f == 0
-    ]
-    parts = [
-        (int(s), int(n), int(o))
-        for f, s, n, o in zip(
-            fragments.frame, fragments.start, fragments.size, fragments.offset, strict=True
-        )
-        if f == 0
-    ]
-    skipped = dict(found.skipped)
-    if len(frames) > 1:
-        skipped["not_ip"] -= 1
-    return [whole, parts, {reason: count for reason, count in skipped.items() if count}]
+        start = front + captured.cumsum() - captured
+        datagrams, _ = dissector.push(data, Frames(start, captured, original, link, host_ns))
+        rows = zip(*(column.tolist() for column in datagrams), strict=True)
+        seen += [
+            (at_ns, str(streams.streams[stream]), data[at : at + size].tobytes())
+            for at, size, stream, at_ns in rows
+        ]
+    dissector.finish()
+    assert counts.frames == len(frames) == counts.datagrams + sum(counts.skipped.values())
+    return [seen, counts.skipped]
+
+
+def check(frames: list[Frame], portions: int = 1) -> None:
+    """The literal dissector finds the same."""
+    seen, skipped = dissect(frames)
+    assert found(frames, portions) == [[tuple(one) for one in seen], skipped]
+
+
+def whole(data: bytes, link: int = _ETHERNET) -> Frame:
+    """A frame that is captured as it was sent."""
+    return Frame(5, link, data, len(data))
+
+
+def test_link_types_are_those_of_the_reference() -> None:
+    assert set(LINKS) == _frames.LINKS
 
 
 def test_a_usual_frame_holds_its_payload() -> None:
-    assert content([_USUAL]) == [[(42, 10, 0x0A000001, 7502)], [], {}]
+    frame = udp_frame(_PAYLOAD)[0]
+    assert found([whole(frame)]) == [[(5, "10.0.0.1 > port 7502", _PAYLOAD)], {}]
 
 
-@pytest.mark.parametrize("at", range(42))
-def test_a_changed_header_means_the_same_alone_and_among_others(at: int) -> None:
-    for value in range(256):
-        changed = bytearray(_USUAL)
-        changed[at] = value
-        assert content([bytes(changed)]) == content([bytes(changed), _ARP]), value
+def kinds() -> list[bytes]:
+    """Ethernet frames with every header that is read."""
+    udp = struct.pack(">HHHH", 5000, 7502, 8 + len(_PAYLOAD), 0) + _PAYLOAD
+    chain = bytes([60, 0, *bytes(6)]) + bytes([51, 1, *bytes(14)]) + bytes([44, 1, *bytes(10)])
+    chain += struct.pack(">BBHI", 17, 0, 0, 9) + udp
+    return [
+        udp_frame(_PAYLOAD)[0],
+        udp_frame(_PAYLOAD, vlans=[0x88A8, 0x8100])[0],
+        udp_frame(bytes(80), mtu=60)[0],
+        link_frame(ipv4_packet(udp, "10.0.0.1", "10.0.0.2", options=bytes(8))),
+        udp_frame(_PAYLOAD, "fe80::1", "fe80::2")[0],
+        udp_frame(bytes(80), "fe80::1", "fe80::2", mtu=100)[0],
+        link_frame(ipv6_packet(chain, "fe80::1", "fe80::2", next_header=0), version=6),
+    ]
 
 
-@pytest.mark.parametrize("cut", range(len(_USUAL) + 1))
-def test_a_cut_frame_means_the_same_alone_and_among_others(cut: int) -> None:
-    assert content([_USUAL], cut) == content([_USUAL, _ARP], cut)
+@pytest.mark.parametrize("kind", range(7))
+def test_frames_with_any_byte_changed_and_cut_anywhere(kind: int) -> None:
+    frame = kinds()[kind]
+    changed = []
+    for at in range(len(frame)):
+        for value in range(256) if at < 64 else (0, 255):
+            one = bytearray(frame)
+            one[at] = value
+            changed.append(whole(bytes(one)))
+    cut = [Frame(5, _ETHERNET, frame[:size], len(frame)) for size in range(len(frame))]
+    short = [whole(frame[:size]) for size in range(len(frame))]
+    for frames in (changed, cut, short):
+        for at in range(0, len(frames), 400):
+            check(frames[at : at + 400])
 
 
-@pytest.mark.parametrize("link", [0, 12, 101, 113, 276, 127])
-def test_other_links_mean_the_same_alone_and_among_others(link: int) -> None:
-    assert content([_USUAL], link=link) == content([_USUAL, _ARP], link=link)
+@pytest.mark.parametrize("link", [*LINKS, 127, -1])
+def test_frames_of_another_link_type_cut_anywhere(link: int) -> None:
+    pick = random.Random(link)
+    for frame in (*kinds(), *(link_frame(one[14:], link=link) for one in kinds())):
+        sizes = range(len(frame) + 1)
+        check([whole(frame[:size], link) for size in sizes])
+        check([Frame(5, link, frame[:size], len(frame)) for size in sizes])
+        changed = []
+        for _ in range(200):
+            one = bytearray(frame)
+            one[pick.randrange(min(len(one), 30))] = pick.choice(
+                [0, 2, 10, 24, 30, 0x45, 0x60, 255]
+            )
+            changed.append(whole(bytes(one), link))
+        check(changed)
+
+
+@pytest.mark.parametrize("tags", range(7, 11))
+def test_tags_are_skipped_up_to_eight(tags: int) -> None:
+    (frame,) = udp_frame(_PAYLOAD, vlans=[0x8100] * tags)
+    check([whole(frame)])
+    assert len(found([whole(frame)])[0]) == (tags <= 8)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("headers", range(14, 18))
+def test_headers_of_ipv6_are_skipped_up_to_fifteen(headers: int) -> None:
+    udp = struct.pack(">HHHH", 5000, 7502, 8 + len(_PAYLOAD), 0) + _PAYLOAD
+    chain = bytes([0, 0, *bytes(6)]) * (headers - 1) + bytes([17, 0, *bytes(6)]) + udp
+    frame = link_frame(ipv6_packet(chain, "fe80::1", "fe80::2", next_header=0), version=6)
+    check([whole(frame)])
+    assert len(found([whole(frame)])[0]) == (headers <= 15)  # type: ignore[arg-type]
 
 
 def test_a_cut_frame_is_no_datagram_though_its_payload_is_there() -> None:
-    padded = _USUAL + bytes(6)
-    assert content([padded], cut=6) == [[], [], {"truncated": 1}]
+    (frame,) = udp_frame(_PAYLOAD)
+    assert found([Frame(0, _ETHERNET, frame, len(frame) + 6)]) == [[], {"truncated": 1}]
+
+
+def test_addresses_of_both_versions_are_different_streams() -> None:
+    frames = [
+        whole(udp_frame(b"x", source, "::9" if ":" in source else "10.0.0.9")[0])
+        for source in ("1.2.3.4", "::102:304", "::ffff:1.2.3.4", "1.2.3.4")
+    ]
+    check(frames)
+    (seen, _) = found(frames)
+    assert len({stream for _, stream, _ in seen}) == 3  # type: ignore[attr-defined]
+
+
+@st.composite
+def traffic(draw: st.DrawFn) -> list[Frame]:
+    """Frames of any link type, tags, version and size, in fragments that arrive in any order."""
+    pick = random.Random(draw(st.integers(0, 2**32)))
+    waiting: list[Frame] = []
+    for _ in range(draw(st.integers(0, 15))):
+        link = pick.choice([_ETHERNET, _ETHERNET, *LINKS])
+        six = pick.random() < 0.4
+        pair = (f"fe80::{pick.randint(1, 2)}", "fe80::9") if six else ("10.0.0.1", "10.0.0.9")
+        parts = udp_frame(
+            pick.randbytes(pick.choice([0, 9, 100, 700])),
+            *pair,
+            ident=pick.randint(1, 3),
+            dport=pick.randint(1, 3),
+            mtu=pick.choice([None, 96, 200]),
+            vlans=pick.choice([[], [0x8100], [0x88A8, 0x8100]]),
+            link=link,
+        )
+        for part in parts:
+            cut = pick.random() < 0.03
+            waiting.append(
+                Frame(0, link, part[: pick.randrange(len(part) + 1)] if cut else part, len(part))
+            )
+    deeds = draw(st.lists(st.sampled_from(["drop", "repeat", "move"]), max_size=8))
+    for deed in deeds:
+        if not waiting:
+            break
+        taken = waiting[pick.randrange(len(waiting))]
+        if deed != "repeat":
+            waiting.remove(taken)
+        if deed != "drop":
+            waiting.insert(pick.randint(0, len(waiting)), taken)
+    steps_ns = [1000, 1000, -2000, 400_000_000, pick.choice([-2 * 10**9, 1000])]
+    host_ns = 10**18
+    frames = []
+    for frame in waiting:
+        host_ns += pick.choice(steps_ns)
+        frames.append(frame._replace(host_ns=host_ns))
+    return frames
+
+
+@settings(max_examples=400, deadline=None)
+@given(frames=traffic(), portions=st.integers(1, 6))
+def test_any_traffic_gives_what_the_literal_dissector_finds(
+    frames: list[Frame], portions: int
+) -> None:
+    check(frames, portions)
+
+
+@settings(max_examples=200, deadline=None)
+@given(pieces=st.lists(st.binary(max_size=80), max_size=20), link=st.sampled_from(LINKS))
+def test_any_bytes_are_counted(pieces: list[bytes], link: int) -> None:
+    check([whole(piece, link) for piece in pieces])
+
+
+@pytest.mark.parametrize(
+    ("start", "captured"),
+    [(-1, 42), (101, 42), (90, 42), (2**62, 2**62), (0, -5), (0, 2**62), (2**62, 1)],
+)
+def test_frames_beyond_their_array_are_refused(start: int, captured: int) -> None:
+    one = np.array([captured])
+    frames = Frames(np.array([start]), one, one, np.array([_ETHERNET]), np.zeros(1, np.int64))
+    with pytest.raises(IndexError):
+        Dissector(CaptureCounts(), StreamTable()).push(np.zeros(100, np.uint8), frames)
+
+
+def test_times_at_the_ends_of_the_clock() -> None:
+    """The stamps that a damaged pcapng file may have."""
+    (first, last) = udp_frame(bytes(100), mtu=80)
+    for times in ((-(2**63) + 2 * 10**9, 2**63 - 10**9), (2**63 - 1, -(2**63) + 2 * 10**9)):
+        check([Frame(at_ns, 1, one, len(one)) for at_ns in times for one in (first, last)])

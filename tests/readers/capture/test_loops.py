@@ -1,4 +1,4 @@
-"""Compiled loops find what numpy finds, in whole captures and in damaged ones."""
+"""Compiled loops over captures: records, whole and damaged, and bytes of packets."""
 
 from __future__ import annotations
 
@@ -15,74 +15,37 @@ from mlbatch.errors import RecordingError
 from mlbatch.native.capture import CaptureLoops
 from mlbatch.readers.byte_records import copy_runs
 from tests.builders.captures import pcap_bytes, udp_frame
-from tests.builders.engines import needs_native
-from tests.builders.reading import Seen, open_capture, read
-from tests.readers.capture.test_recording import damaged, mixed_file
-
-pytestmark = needs_native
+from tests.builders.reading import open_capture, read
+from tests.readers.capture.test_recording import damaged, mixed_frames
+from tests.reference.capture import dissect, pcap_frames
 
 BUFFERS = (64, 700, 4096, 65_536)
-
-
-def outcome(
-    path: Path, engine: str, buffer_bytes: int
-) -> tuple[list[Seen], object, object, object]:
-    """Result of reading a capture: packets, counts, notes and an error."""
-    recording = open_capture(path, engine=engine, buffer_bytes=buffer_bytes)
-    try:
-        seen, error = read(recording), ""
-    except RecordingError as err:
-        seen, error = [], str(err)
-    return seen, recording.counts, recording.notes, error
 
 
 @pytest.mark.parametrize("seed", range(120))
 def test_captures_whole_and_damaged(tmp_path: Path, seed: int) -> None:
     pick = random.Random(seed)
     path = tmp_path / "capture"
-    content = mixed_file(pick)
-    for written in (content, damaged(content, pick), damaged(content, pick)):
-        path.write_bytes(written)
+    written = pcap_bytes(mixed_frames(pick), big_endian=pick.random() < 0.5)
+    for content in (written, damaged(written, pick), damaged(written, pick)):
+        path.write_bytes(content)
         try:
-            open_capture(path)
+            recording = open_capture(path, buffer_bytes=pick.choice(BUFFERS))
         except RecordingError:
             continue
-        buffer_bytes = pick.choice(BUFFERS)
-        assert outcome(path, "native", buffer_bytes) == outcome(path, "numpy", buffer_bytes)
-
-
-def test_headers_with_any_byte_changed(tmp_path: Path) -> None:
-    pick, path = random.Random(1), tmp_path / "capture.pcap"
-    plain = udp_frame(bytes(48), ident=3)
-    parts = udp_frame(bytes(4000), ident=4, mtu=1500)
-    for frame in (plain[0], parts[0], parts[-1]):
-        changed: list[tuple[int, bytes]] = []
-        for place in range(42):
-            for value in (0, 1, 0x20, 0x45, 0x46, 0x4F, 0x7F, 0x80, 0xFF, pick.randrange(256)):
-                one = bytearray(frame)
-                one[place] = value
-                changed.append((len(changed), bytes(one)))
-        path.write_bytes(pcap_bytes(changed))
-        assert outcome(path, "native", 65_536) == outcome(path, "numpy", 65_536)
+        expected, skipped = dissect(pcap_frames(content))
+        seen = [(one.host_ns, one.stream, one.payload) for one in read(recording)]
+        assert seen == expected
+        assert recording.counts.skipped == skipped
 
 
 def test_more_frames_than_there_is_room_for(tmp_path: Path) -> None:
     path = tmp_path / "capture.pcap"
     frames = [(1_000_000 + number, b"\x00" * (number % 3)) for number in range(40_000)]
     path.write_bytes(pcap_bytes([*frames, *((1, one) for one in udp_frame(b"last"))]))
-    found = outcome(path, "native", 4 << 20)
-    assert found == outcome(path, "numpy", 4 << 20)
-    assert [one.payload for one in found[0]] == [b"last"]
-
-
-def test_frames_that_claim_to_lie_elsewhere_are_left_to_others() -> None:
-    loops, data = CaptureLoops(), np.zeros(100, np.uint8)
-    start = np.array([-1, 101, 90, 2**62, 0, 0])
-    captured = np.array([42, 42, 42, 2**62, -5, 2**62])
-    found = loops.dissect(data, start, captured, captured)
-    assert found.others.tolist() == list(range(6))
-    assert not found.datagrams.size
-    assert not found.fragments.size
+    recording = open_capture(path)
+    assert [one.payload for one in read(recording)] == [b"last"]
+    assert recording.counts.skipped == {"truncated": 40_000}
 
 
 def test_runs_are_copied() -> None:
