@@ -358,7 +358,7 @@ typedef struct {
     int64_t most_first;
     int64_t first_count;
     uint64_t *first_keys; /* (most_first, KEY_WORDS): of the sets that were open first */
-    int64_t *settled;     /* what became of inherited sets, as a reason */
+    int64_t *settled;     /* of inherited sets: a reason, -1: open */
 } Dissection;
 
 /* Hash of a packet: `lidar/content_keys.py`. */
