@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Generator, Sequence
+from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple, TypeAlias
@@ -389,7 +389,8 @@ class RecordPiece(NamedTuple):
 
 
 # Arrays to copy from (`decode/scan_buffer.py`): point, label, reflectivity. Computed: time in s as
-# float32 (toward zero) and as float64, ring, range in mm, timestamp in s.
+# float32 (toward zero) and as float64, ring, range in mm, timestamp in s, ring and sensor as
+# float32; a whole record of LAS, of dense scans.
 RECORD_KINDS = (
     "point",
     "label",
@@ -399,14 +400,30 @@ RECORD_KINDS = (
     "ring_i4",
     "range_mm_u4",
     "stamp_f8",
+    "ring_f4",
+    "lidar_f4",
+    "las",
 )
 
 
 class RecordLayout(NamedTuple):
-    """Point records that engines can pack while they decode; bytes between pieces are zero."""
+    """Point records that are packed while points are decoded; bytes between pieces are zero."""
 
     step: int  # bytes of a record
     pieces: tuple[RecordPiece, ...]
+    # Of runs in which no sensor has reflectivities; None: the same, with zeros.
+    plain: RecordLayout | None = None
+    # By timescale and start of a scan, ns: where timestamps in s begin, s after the timescale does.
+    # None: where it does.
+    epoch_s: Callable[[str, int], int] | None = None
+
+
+class PackedTotals(NamedTuple):
+    """What a header says of the points of a scan."""
+
+    low_m: tuple[float, ...]  # x, y, z; above `high_m` without points
+    high_m: tuple[float, ...]
+    second_returns: int  # points that are the farther of two returns
 
 
 class PackedPoints(NamedTuple):
@@ -420,6 +437,7 @@ class PackedPoints(NamedTuple):
     begin: int
     end: int
     shape: tuple[int, ...]
+    totals: PackedTotals | None = None  # of LAS
 
 
 PACKED_ROOM = 4096

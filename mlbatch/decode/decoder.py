@@ -75,6 +75,8 @@ class Decoder:
         self._has_reflectivity = "reflectivity" in extras and any(
             source.lidar.has_reflectivity for source in sources
         )
+        if record is not None and record.plain is not None and not self._has_reflectivity:
+            record = record.plain
         self._engine = Engine(
             sources,
             boxes_m,
@@ -83,6 +85,7 @@ class Decoder:
             organized_slots=self._slots if self._is_organized else 0,
             # Points are sorted by arrays.
             record=None if info.sort == "points" else record,
+            timescale=info.timescale,
         )
         self._counts = self._engine.counts
         self._buffer = self._new_buffer(0)
@@ -195,7 +198,8 @@ class Decoder:
             fill=header.fill,
             is_partial=header.is_partial,
             packed=buffer.packed_points(
-                (self._slots, len(columns)) if self._is_organized else (points,)
+                (self._slots, len(columns)) if self._is_organized else (points,),
+                self._engine.totals,
             ),
         )
 

@@ -11,12 +11,13 @@ import numpy.typing as npt
 
 from mlbatch.arrays import F32Array, F64Array, I64Array
 from mlbatch.decode.groups import CORRECTED, MIRRORED, TURNING, SensorGroup, group_key
+from mlbatch.decode.records import RecordPacker
 from mlbatch.decode.scan_buffer import ScanBuffer
 from mlbatch.decode.source import Source
 from mlbatch.lidar.geometry import angles_rad, rotor_angles
-from mlbatch.native.library import Group, Piece, Scan, address, library
+from mlbatch.native.library import Group, Scan, address, library
 from mlbatch.report.ledger import PointCounts
-from mlbatch.types import PACKED_ROOM, RECORD_KINDS, RecordLayout, WindowColumns
+from mlbatch.types import PACKED_ROOM, PackedTotals, RecordLayout, WindowColumns
 
 _UNSURE = np.float32(2)
 # Columns of an organized scan that are packed together: slots of several columns are adjacent in
@@ -40,14 +41,17 @@ class Engine:
         first_sensor: int = 0,
         organized_slots: int = 0,
         record: RecordLayout | None = None,
+        timescale: str = "",
     ) -> None:
         """boxes_m: (k, 6); extras: optional arrays of the scan that some sensor has.
 
         first_sensor: index of the first source in the scan; organized_slots: slots of a row of an
         organized scan, 0: scans are dense; record: layout of the records that the output takes,
-        None: it takes arrays.
+        None: it takes arrays; timescale: of the stamps.
         """
         self.record = record
+        self._timescale = timescale
+        self._packer: RecordPacker | None = None
         self._library = library()
         self._extras = extras
         # Of the last call; None: before the first.
@@ -94,6 +98,11 @@ class Engine:
             for group, member in zip(self._group_of, self._member_of, strict=True)
         ]
 
+    @property
+    def totals(self) -> PackedTotals | None:
+        """Those of the points of the last call; None without."""
+        return None if self._packer is None else self._packer.totals
+
     def decode(
         self, columns: WindowColumns, start_ns: int, first_number: int, out: ScanBuffer
     ) -> int:
@@ -107,6 +116,8 @@ class Engine:
             group.use_rings()
         self._use_outputs(out)
         kept = self._use_columns(columns)
+        if self._packer is not None:
+            self._packer.start(scan, start_ns, self._timescale)
         scan.start_ns = start_ns
         scan.first_number = first_number
         scan.first_row = 0
@@ -120,24 +131,19 @@ class Engine:
         """Have records packed from scratch arrays; slots: most of a column."""
         is_organized = bool(self._scan.row_slots)
         near = _NEAR_COLUMNS if is_organized else 1
-        pieces = [
-            Piece(RECORD_KINDS.index(one.kind), one.offset, one.source, one.bytes)
-            for one in record.pieces
-            # Without a sensor that has them, reflectivities are not decoded: they stay 0.
-            if one.kind != "reflectivity" or "reflectivity" in self._extras
-        ]
-        self._pieces = (Piece * len(pieces))(*pieces)
+        packer = RecordPacker(record, has_reflectivity="reflectivity" in self._extras)
+        packer.describe(self._scan)
+        self._packer = packer
         if is_organized:
             self._near = ScanBuffer(near, self._scan.row_slots + _SPARE_SLOTS)
         else:
             self._near = ScanBuffer(slots + _SPARE_POINTS, None)
-        scan = self._scan
-        scan.record_bytes = record.step
-        scan.piece_count = len(pieces)
-        scan.pieces = ctypes.addressof(self._pieces)
-        scan.near_columns = near
-        kinds = [RECORD_KINDS[piece.kind] for piece in pieces]
-        self._set_arrays(self._near, "range_mm_u4" in kinds, "reflectivity" in kinds)
+        self._scan.near_columns = near
+        has_reflectivity = not packer.kinds.isdisjoint({"reflectivity", "las"})
+        self._set_arrays(
+            *(self._near, "range_mm_u4" in packer.kinds),
+            has_reflectivity and "reflectivity" in self._extras,
+        )
 
     def _use_columns(self, columns: WindowColumns) -> list[npt.NDArray[Any]]:
         """Point the struct to the columns; return the arrays to keep."""

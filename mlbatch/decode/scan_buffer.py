@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from mlbatch.types import PACKED_ROOM, PackedPoints, RecordLayout
+from mlbatch.types import PACKED_ROOM, PackedPoints, PackedTotals, RecordLayout
 
 # All of a point but its readings, in one word of 8 bytes that is copied as one. The time, in ns
 # after the start of the scan, is the low half, so that it can be added as a number.
@@ -47,12 +47,14 @@ class ScanBuffer:
         self.return_type = self.label["return_type"]
         self.lidar_id = self.label["lidar_id"]
 
-    def packed_points(self, shape: tuple[int, ...]) -> PackedPoints | None:
+    def packed_points(
+        self, shape: tuple[int, ...], totals: PackedTotals | None
+    ) -> PackedPoints | None:
         """Return the records of a scan of this shape; None if points are not packed."""
         if self.record is None:
             return None
         end = PACKED_ROOM + math.prod(shape) * self.record.step
-        return PackedPoints(self.packed, PACKED_ROOM, end, shape)
+        return PackedPoints(self.packed, PACKED_ROOM, end, shape, totals)
 
 
 def by_time(points: ScanBuffer, count: int, out: ScanBuffer) -> None:

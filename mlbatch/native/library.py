@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from mlbatch.native import library_path
 
-_ABI = 11
+_ABI = 12
 _WORD = ctypes.c_int64
 _ADDRESS = ctypes.c_void_p
 _NUMBER = ctypes.c_double
@@ -21,6 +21,7 @@ _from_buffer: Callable[[Any], Any] = ctypes.c_char.from_buffer
 _FUNCTIONS: dict[str, tuple[type[Any], ...]] = {
     "mlbatch_abi": (),
     "mlbatch_decode": (_ADDRESS,),
+    "mlbatch_pack": (_ADDRESS, _ADDRESS, _WORD, _ADDRESS),
     "mlbatch_angles": (_WORD, _ADDRESS, _ADDRESS, _ADDRESS),
     "mlbatch_merge": (_WORD, _ADDRESS, _WORD, *[_ADDRESS] * 5),
     "mlbatch_figures": (_WORD, *[_ADDRESS] * 4, _WORD, _ADDRESS, _WORD, _ADDRESS, _ADDRESS),
@@ -55,6 +56,7 @@ _FUNCTIONS: dict[str, tuple[type[Any], ...]] = {
     ),
 }
 _WITHOUT_RESULT = (
+    "mlbatch_pack",
     "mlbatch_dissect",
     "mlbatch_copy",
     "mlbatch_gather",
@@ -185,6 +187,30 @@ class Scan(ctypes.Structure):
         ("piece_count", _WORD),
         ("pieces", _ADDRESS),
         ("near_columns", _WORD),
+        ("stamp_start_ns", _WORD),
+        ("totals", _ADDRESS),
+    ]
+
+
+class Totals(ctypes.Structure):
+    """What a header of LAS says of all points."""
+
+    _fields_: ClassVar = [
+        ("low", ctypes.c_float * 4),
+        ("high", ctypes.c_float * 4),
+        ("second", _WORD),
+    ]
+
+
+class Rows(ctypes.Structure):
+    """Values of points to be packed."""
+
+    _fields_: ClassVar = [
+        ("point", _ADDRESS),
+        ("label", _ADDRESS),
+        ("range_m", _ADDRESS),
+        ("reflectivity", _ADDRESS),
+        ("step", _WORD),
     ]
 
 

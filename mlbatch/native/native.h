@@ -16,7 +16,7 @@
 #endif
 
 /* To be changed with every change of a struct or of a signature. */
-#define MLBATCH_ABI 11
+#define MLBATCH_ABI 12
 
 #if defined(_WIN32)
 #define EXPORT __declspec(dllexport)
@@ -174,7 +174,10 @@ enum {
     SECONDS_F8,
     RING_I4,
     RANGE_MM_U4,
-    STAMP_F8
+    STAMP_F8,
+    RING_F4,
+    LIDAR_F4,
+    LAS
 };
 
 /* A piece of a packed record; source and bytes: of a copy, from a row of its array. */
@@ -184,6 +187,13 @@ typedef struct {
     int64_t source;
     int64_t bytes;
 } Piece;
+
+/* What a header of LAS says of all points: extremes of x, y, z, m, and intensity; second returns. */
+typedef struct {
+    float low[4];
+    float high[4];
+    int64_t second;
+} Totals;
 
 /* A scan under construction. */
 typedef struct {
@@ -217,6 +227,8 @@ typedef struct {
     int64_t piece_count;
     const Piece *pieces;
     int64_t near_columns;
+    int64_t stamp_start_ns; /* start_ns on the clock of STAMP_F8 */
+    Totals *totals;         /* of LAS, added to */
 } Scan;
 
 /* Values of points to be packed, as the arrays of a scan; step: rows from one to the next. */
@@ -229,7 +241,7 @@ typedef struct {
 } Rows;
 
 /* Pack so many points to records; `pack.c`. */
-void mlbatch_pack(const Scan *scan, const Rows *rows, int64_t count, uint8_t *record);
+EXPORT void mlbatch_pack(const Scan *scan, const Rows *rows, int64_t count, uint8_t *record);
 
 /* Pack the rows of columns [begin, end) of an organized scan, which are in the scratch arrays. */
 void mlbatch_pack_rows(const Scan *scan, int64_t begin, int64_t end);

@@ -1,8 +1,7 @@
 /* Points to packed records of the output, while they are in the first cache.
 
    A record is a list of pieces (`Piece`): bytes copied from the arrays of a scan, and values
-   computed as in `writers/point_layouts.py`, in float64 and rounded once. Bytes between the
-   pieces are not written. */
+   computed of them in float64 and rounded once. Bytes between the pieces are not written. */
 #include <string.h>
 
 #include "native.h"
@@ -13,6 +12,16 @@
 static inline uint32_t time_of(int64_t label)
 {
     return (uint32_t)(uint64_t)label;
+}
+
+static inline int32_t ring_of(int64_t label)
+{
+    return (int32_t)((uint64_t)label >> 32 & 0xFFFF);
+}
+
+static inline int32_t lidar_of(int64_t label)
+{
+    return (int32_t)((uint64_t)label >> 56);
 }
 
 static inline double seconds(uint32_t time_ns)
@@ -88,40 +97,138 @@ static int is_standard(const Scan *scan)
         && piece[2].kind == COPY_LABEL && piece[2].offset == 20 && piece[2].bytes == 4;
 }
 
-/* One computed piece of all points. */
-static void compute(const Scan *scan, const Rows *rows, int64_t kind, int64_t count, uint8_t *to)
+/* -- LAS ---------------------------------------------------------------------------------------- */
+
+/* Vectors as GCC and Clang have them, for every processor. */
+typedef float Four __attribute__((vector_size(16)));
+typedef int32_t FourWords __attribute__((vector_size(16)));
+typedef float Pair __attribute__((vector_size(8)));
+typedef double Doubles __attribute__((vector_size(16)));
+#if defined(__clang__)
+#define EVEN_WORDS(first, second) __builtin_shufflevector(first, second, 0, 2, 4, 6)
+#else
+#define EVEN_WORDS(first, second) __builtin_shuffle(first, second, (FourWords){0, 2, 4, 6})
+#endif
+
+/* Coordinates and one more value in multiples of 0.1 mm, ties to even: the sum has no bits for
+   fractions, and its low half is the number. The product is exact, since a float32 has 24 bits
+   and 10000 has 14. */
+static inline FourWords steps(const float *point)
 {
-    const int64_t step = scan->record_bytes;
-    /* As Python's divmod, which rounds down. */
-    int64_t whole_s = scan->start_ns / NS_PER_S, rest_ns = scan->start_ns % NS_PER_S;
-    if (rest_ns < 0) {
-        whole_s--;
-        rest_ns += NS_PER_S;
-    }
-    for (int64_t row = 0; row < count; row++, to += step) {
-        const int64_t from = row * rows->step;
-        const uint32_t time_ns = time_of(rows->label[from]);
-        if (kind == SECONDS_F4) {
-            const float value = seconds_toward_zero(time_ns);
-            memcpy(to, &value, sizeof value);
-        } else if (kind == SECONDS_F8) {
-            const double value = seconds(time_ns);
-            memcpy(to, &value, sizeof value);
-        } else if (kind == STAMP_F8) {
-            const double rest_s = (double)(time_ns + rest_ns) / (double)NS_PER_S;
-            const double value = rest_s + (double)whole_s;
-            memcpy(to, &value, sizeof value);
-        } else if (kind == RING_I4) {
-            const int32_t value = (int32_t)((uint64_t)rows->label[from] >> 32 & 0xFFFF);
-            memcpy(to, &value, sizeof value);
-        } else {
-            const uint32_t value = millimetres(rows->range_m[from]);
-            memcpy(to, &value, sizeof value);
-        }
-    }
+    const Doubles per_m = {1e4, 1e4}, whole = {0x1.8p52, 0x1.8p52};
+    Pair first, second;
+    memcpy(&first, point, sizeof first);
+    memcpy(&second, point + 2, sizeof second);
+    const Doubles xy = __builtin_convertvector(first, Doubles) * per_m + whole;
+    const Doubles z = __builtin_convertvector(second, Doubles) * per_m + whole;
+    return EVEN_WORDS((FourWords)xy, (FourWords)z);
 }
 
-void mlbatch_pack(const Scan *scan, const Rows *rows, int64_t count, uint8_t *record)
+/* The nearest number of 16 bits, ties to even: as above, in float32. */
+static inline uint32_t level(float intensity)
+{
+    const float most = 65535.0f, positive = intensity > 0.0f ? intensity : 0.0f;
+    const float whole = (positive < most ? positive : most) + 0x1p23f;
+    uint32_t bits;
+    memcpy(&bits, &whole, sizeof bits);
+    return bits & 0xFFFF;
+}
+
+/* By return type: number of a return, and in the upper half that of all returns. Of two returns the
+   first is the nearer one. */
+static const uint8_t RETURNS[8] = {0x11, 0x11, 0x11, 0x21, 0x22, 0x21, 0x22, 0x11};
+enum { SECOND = 0x22 };
+
+static inline Four chosen(FourWords is_first, Four first, Four second)
+{
+    return (Four)((is_first & (FourWords)first) | (~is_first & (FourWords)second));
+}
+
+/* Point data record format 6 and extra bytes, as in `las_encoder.py`; the points are side by side.
+   bytes: of the record, the last two a reflectivity or not there. */
+static void pack_las(const Rows *rows, int64_t count, int64_t bytes, double whole_s,
+                     int64_t rest_ns, Totals *totals, uint8_t *restrict record)
+{
+    enum { LEVEL_AT = 12, ZERO_AT = 16, STAMP_AT = 22, LABEL_AT = 30, REAL_AT = 37, LAST_AT = 41 };
+    const uint64_t ring_bits = UINT64_C(0xFFFF) << 32;
+    const float *restrict point = rows->point;
+    const int64_t *restrict labels = rows->label;
+    const uint16_t *restrict reflectivity = bytes > LAST_AT ? rows->reflectivity : 0;
+    Four low, high;
+    memcpy(&low, totals->low, sizeof low);
+    memcpy(&high, totals->high, sizeof high);
+    int64_t second = 0;
+    uint64_t last = 0;
+    uint32_t number = 0;
+    double stamp_s = 0;
+    for (int64_t row = 0; row < count; row++, point += 4, record += bytes) {
+        const uint64_t label = (uint64_t)labels[row];
+        /* Points of a column mostly differ in the ring alone. */
+        if (!row || (label & ~ring_bits) != last) {
+            last = label & ~ring_bits;
+            stamp_s = (double)(time_of(labels[row]) + rest_ns) / (double)NS_PER_S + whole_s;
+            const uint64_t type = label >> 48 & 0xFF;
+            number = RETURNS[type < 8 ? type : 0];
+        }
+        Four values;
+        memcpy(&values, point, sizeof values);
+        low = chosen(values < low, values, low);
+        high = chosen(values > high, values, high);
+        second += number == SECOND;
+        const FourWords xyz = steps(point);
+        const uint32_t levels = level(point[3]) | number << 16;
+        /* Flags, classification, user data and scan angle are 0; 0 is no source. */
+        const uint64_t source = ((label >> 56) + 1) << 32;
+        memcpy(record, &xyz, sizeof xyz);
+        memcpy(record + LEVEL_AT, &levels, sizeof levels);
+        memcpy(record + ZERO_AT, &source, 6);
+        memcpy(record + STAMP_AT, &stamp_s, sizeof stamp_s);
+        /* Time, ring, return type; the sensor is overwritten. */
+        memcpy(record + LABEL_AT, &label, sizeof label);
+        memcpy(record + REAL_AT, point + 3, sizeof *point);
+        if (reflectivity)
+            memcpy(record + LAST_AT, reflectivity + row, sizeof *reflectivity);
+    }
+    memcpy(totals->low, &low, sizeof low);
+    memcpy(totals->high, &high, sizeof high);
+    totals->second += second;
+}
+
+/* -- pieces ------------------------------------------------------------------------------------- */
+
+/* One computed piece of all points. */
+static void compute(const Scan *scan, const Rows *rows, const Piece *piece, int64_t count, uint8_t *to)
+{
+#define EACH(type, expression)                                                                     \
+    for (int64_t row = 0; row < count; row++, to += scan->record_bytes) {                          \
+        const int64_t from = row * rows->step;                                                     \
+        const type value = (expression);                                                           \
+        memcpy(to, &value, sizeof value);                                                          \
+    }                                                                                              \
+    break
+    /* As Python's divmod, which rounds down. */
+    int64_t whole = scan->stamp_start_ns / NS_PER_S, rest_ns = scan->stamp_start_ns % NS_PER_S;
+    if (rest_ns < 0) {
+        whole--;
+        rest_ns += NS_PER_S;
+    }
+    const double whole_s = (double)whole;
+    const int64_t *label = rows->label;
+    switch (piece->kind) {
+    case SECONDS_F4: EACH(float, seconds_toward_zero(time_of(label[from])));
+    case SECONDS_F8: EACH(double, seconds(time_of(label[from])));
+    case STAMP_F8:
+        EACH(double, (double)(time_of(label[from]) + rest_ns) / (double)NS_PER_S + whole_s);
+    case RING_I4: EACH(int32_t, ring_of(label[from]));
+    case RING_F4: EACH(float, (float)ring_of(label[from]));
+    case LIDAR_F4: EACH(float, (float)lidar_of(label[from]));
+    case LAS: pack_las(rows, count, piece->bytes, whole_s, rest_ns, scan->totals, to); break;
+    default: EACH(uint32_t, millimetres(rows->range_m[from]));
+    }
+#undef EACH
+}
+
+EXPORT void mlbatch_pack(const Scan *scan, const Rows *rows, int64_t count, uint8_t *record)
 {
     if (is_standard(scan)) {
         pack_standard(rows, count, record);
@@ -145,7 +252,7 @@ void mlbatch_pack(const Scan *scan, const Rows *rows, int64_t count, uint8_t *re
             copy(from + piece->source, width * rows->step, piece->bytes, count,
                  scan->record_bytes, record + piece->offset);
         else
-            compute(scan, rows, piece->kind, count, record + piece->offset);
+            compute(scan, rows, piece, count, record + piece->offset);
     }
 }
 

@@ -23,7 +23,7 @@ from mlbatch.arrays import (
 from mlbatch.errors import UsageError
 from mlbatch.types import RunInfo
 from mlbatch.units import NS_PER_S
-from mlbatch.writers.point_layouts import CLOUD_LAYOUTS, PLY_LAYOUT, points_of
+from mlbatch.writers.point_layouts import CLOUD_LAYOUTS, PLY_LAYOUT
 
 Records: TypeAlias = npt.NDArray[np.void]
 
@@ -242,9 +242,9 @@ class Scan:
         self._require(f"layout {layout}", *needed)
         if layout == "autoware":
             self._require_poses(f"layout {layout}")
-        points = points_of(self._record())
-        records: Records = np.zeros(points.time_ns.shape or (0,), chosen.dtype)
-        chosen.pack(points, records)
+        scan = self._record()
+        records: Records = np.zeros(scan.time_ns.T.shape or (0,), chosen.dtype)
+        chosen.pack(scan, records)
         in_shape: Records = records.T
         return in_shape
 

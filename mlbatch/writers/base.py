@@ -178,7 +178,7 @@ class WriterModule(Protocol):
     # Optional, only for folders: FILE_SUFFIXES, a tuple with the suffixes of the files of a scan,
     # without the first dot. Without it the suffix is FORMAT.
     # Optional: record_layout(options: WriterOptions) -> RecordLayout | None, records of points
-    # that the writer takes packed (`Scan.packed`). Engines that cannot pack give arrays instead.
+    # that the writer takes packed (`Scan.packed`). With `--sort points` scans have arrays instead.
 
     def extras(self, options: WriterOptions) -> frozenset[str]:
         """Return the optional contents that the output includes.

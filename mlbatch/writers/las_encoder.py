@@ -1,4 +1,4 @@
-"""Scans as LAS 1.4 files, written by laspy.
+"""Scans as LAS 1.4 files, and as LAZ, compressed by lazrs.
 
 Sources: ASPRS, "LAS specification 1.4 R15", tables 3, 4, 16 and 24; docs/sources/outputs.md
 section 6.
@@ -8,147 +8,58 @@ from __future__ import annotations
 
 import importlib
 import io
+import struct
 from datetime import datetime, timezone
 from types import ModuleType
-from typing import Any
-
-import numpy as np
-import numpy.typing as npt
+from typing import TYPE_CHECKING
 
 import mlbatch
-from mlbatch.arrays import F64Array, I32Array, I64Array, U8Array
 from mlbatch.clocks.timescale import GPS_EPOCH_S, TAI, TAI_GPS_S, UTC, gps_utc_s
 from mlbatch.errors import ExportError, UsageError, install_extra
-from mlbatch.types import Scan
+from mlbatch.types import RecordLayout, RecordPiece
 from mlbatch.units import NS_PER_S
-from mlbatch.writers.output_file import Bytes
+from mlbatch.writers.point_layouts import ScanRecords, record_bytes
 from mlbatch.writers.scan_comments import scan_comments
+
+if TYPE_CHECKING:
+    from mlbatch.types import PackedPoints, Scan
+    from mlbatch.writers.output_file import Bytes
 
 LAS_EXTRAS = frozenset({"reflectivity"})
 # Coordinates are int32 multiples of it: 0.05 mm of error, up to 214 km from the origin.
 SCALE_M = 1e-4
-_POINT_FORMAT = 6
-_FARTHEST_M = float(np.iinfo(np.int32).max) * SCALE_M
-_MOST_INTENSITY = 65535
+_FARTHEST_M = (2**31 - 1) * SCALE_M
 # Adjusted standard GPS time is GPS time minus so many seconds.
 _ADJUSTMENT_S = 10**9
-# Name, type and description of the extra bytes.
+# Table 3: signature, source, encoding, GUID, version, system, software, day and year, sizes of the
+# header and up to the points, number of VLRs, point format and bytes of a point, counts of earlier
+# versions, scales, offsets, highest and lowest x, y, z, waveforms, extended VLRs, points, and those
+# by number of return.
+_HEADER = struct.Struct("<4sHH16sBB32s32sHHHIIBH6I6d6dQQIQ15Q")
+_STANDARD_TIME = 1
+# Required of this point format, also without a coordinate system.
+_WKT = 16
+_POINT_FORMAT = 6
+_COMPRESSED = 128
+# Table 4: reserved, user, number, bytes after it, description.
+_VLR = struct.Struct("<H16sHH32s")
+# Table 24: data type, options (lowest and highest are given), name, lowest, highest, description.
+_EXTRA = struct.Struct("<2xBB32s4x24x8s16x8s16x24x24x32s")
+_HAS_EXTREMES = 6
+# Name, data type, description, form of the extremes, and those of no points.
 _EXTRA_BYTES = (
-    ("time_ns", "u4", "ns after start_ns"),
-    ("ring", "u2", "channel over all sensors"),
-    ("return_type", "u1", "0 unknown, 1 to 7"),
-    ("intensity_f32", "f4", "as sent by the sensor"),
+    ("time_ns", 5, "ns after start_ns", "<Q"),
+    ("ring", 3, "channel over all sensors", "<Q"),
+    ("return_type", 1, "0 unknown, 1 to 7", "<Q"),
+    ("intensity_f32", 9, "as sent by the sensor", "<d"),
+    # Only where a sensor of the run has it.
+    ("reflectivity", 3, "calibrated by the sensor", "<Q"),
 )
-# Only where a sensor of the run has it.
-_REFLECTIVITY = ("reflectivity", "u2", "calibrated by the sensor")
-# By return type (docs/formats.md#npz): of two returns the first is the nearer one.
-_RETURN_NUMBER = np.array([1, 1, 1, 1, 2, 1, 2, 1], np.uint8)
-_NUMBER_OF_RETURNS = np.array([1, 1, 1, 2, 2, 2, 2, 1], np.uint8)
+_NO_EXTREMES = {"<Q": (2**64 - 1, 0), "<d": (1.7976931348623157e308, -1.7976931348623157e308)}
+_EXTRA_VALUES = struct.Struct("<30xIHBfH")
 # Of the record with start_ns, sensors and so on: user and number.
 VLR_USER = "mlbatch"
 VLR_NUMBER = 1
-
-
-def load_laspy(name: str) -> ModuleType:
-    """Return laspy; UsageError without it or, for laz, without its compressor."""
-    try:
-        if name == "laz":
-            importlib.import_module("lazrs")
-        return importlib.import_module("laspy")
-    except ImportError as err:
-        raise UsageError(
-            f"--format {name}: expected the packages laspy and lazrs, found none ({err}); "
-            f"{install_extra('las')}"
-        ) from err
-
-
-class LasEncoder:
-    """Encodes scans as LAS or LAZ files."""
-
-    def __init__(self, laspy: ModuleType, *, compresses: bool) -> None:
-        self._laspy = laspy
-        self._compresses = compresses
-
-    def encode(self, scan: Scan) -> list[Bytes]:
-        """Return the file of a scan; ExportError where coordinates do not fit into int32."""
-        laspy = self._laspy
-        header = self._header(scan)
-        points = laspy.PackedPointRecord.zeros(len(scan.time_ns), header.point_format)
-        _fill(points, scan)
-        stream = io.BytesIO()
-        # Threads come from --jobs.
-        backend = laspy.LazBackend.Lazrs if self._compresses else None
-        with laspy.LasWriter(
-            stream, header, do_compress=self._compresses, laz_backend=backend, closefd=False
-        ) as writer:
-            writer.write_points(points)
-        return [stream.getbuffer()]
-
-    def _header(self, scan: Scan) -> Any:
-        """Return a header without points; laspy has no types."""
-        laspy = self._laspy
-        header = laspy.LasHeader(point_format=_POINT_FORMAT, version="1.4")
-        header.scales = np.full(3, SCALE_M)
-        header.offsets = np.zeros(3)
-        # Equal runs give equal bytes: the day of the scan, not of the run.
-        header.creation_date = datetime.fromtimestamp(
-            scan.start_ns // NS_PER_S, timezone.utc
-        ).date()
-        header.system_identifier = "mlbatch"
-        header.generating_software = f"mlbatch {mlbatch.__version__}"
-        # Required of this point format, also without a coordinate system.
-        header.global_encoding.wkt = True
-        if scan.info.timescale in (UTC, TAI):
-            header.global_encoding.gps_time_type = laspy.header.GpsTimeType.STANDARD
-        further = () if scan.reflectivity is None else (_REFLECTIVITY,)
-        header.add_extra_dims([laspy.ExtraBytesParams(*one) for one in (*_EXTRA_BYTES, *further)])
-        text = "\n".join(scan_comments(scan, "x y z m; gps_time s; time_ns ns after start_ns"))
-        header.vlrs.append(laspy.VLR(VLR_USER, VLR_NUMBER, "scan", text.encode()))
-        return header
-
-
-def _fill(points: Any, scan: Scan) -> None:
-    """Set all fields; laspy has no types."""
-    for name, axis in (("X", 0), ("Y", 1), ("Z", 2)):
-        points[name] = _steps(scan, axis)
-    points["intensity"] = np.clip(np.rint(scan.intensity), 0, _MOST_INTENSITY).astype(np.uint16)
-    points["return_number"] = _by_type(_RETURN_NUMBER, scan.return_type)
-    points["number_of_returns"] = _by_type(_NUMBER_OF_RETURNS, scan.return_type)
-    # 0 is reserved for points that were made in this file.
-    points["point_source_id"] = scan.lidar_id.astype(np.uint16) + 1
-    points["gps_time"] = gps_time_s(scan)
-    points["time_ns"] = scan.time_ns
-    points["ring"] = scan.ring
-    points["return_type"] = scan.return_type
-    points["intensity_f32"] = scan.intensity
-    if scan.reflectivity is not None:
-        points["reflectivity"] = scan.reflectivity
-
-
-def _by_type(table: U8Array, return_type: U8Array) -> U8Array:
-    found: U8Array = table[np.minimum(return_type, len(table) - 1)]
-    return found
-
-
-def _steps(scan: Scan, axis: int) -> I32Array:
-    """Return a coordinate in multiples of the scale."""
-    value_m: npt.NDArray[np.float64] = scan.xyz[:, axis].astype(np.float64)
-    farthest_m = float(np.abs(value_m).max(initial=0.0))
-    if farthest_m > _FARTHEST_M:
-        raise ExportError(
-            f"scan {scan.index}: expected coordinates up to {_FARTHEST_M:.0f} m for las and laz, "
-            f"found {farthest_m:.0f} m; write another format, or --max-range"
-        )
-    return np.rint(value_m / SCALE_M).astype(np.int32)
-
-
-def gps_time_s(scan: Scan) -> F64Array:
-    """Return adjusted standard GPS time; on other clocks than UTC and TAI their own seconds."""
-    base_ns = scan.start_ns - gps_shift_s(scan.info.timescale, scan.start_ns) * NS_PER_S
-    whole_s, rest_ns = divmod(base_ns, NS_PER_S)
-    time_ns: I64Array = scan.time_ns.astype(np.int64) + rest_ns
-    time_s: F64Array = time_ns / NS_PER_S
-    return np.add(time_s, whole_s, out=time_s)
 
 
 def gps_shift_s(timescale: str, start_ns: int) -> int:
@@ -158,3 +69,106 @@ def gps_shift_s(timescale: str, start_ns: int) -> int:
         TAI: GPS_EPOCH_S + _ADJUSTMENT_S + TAI_GPS_S,
     }
     return shifts.get(timescale, 0)
+
+
+# Point data record format 6, then the extra bytes. Times are adjusted standard GPS time; on other
+# clocks than UTC and TAI their own seconds.
+_PLAIN = RecordLayout(41, (RecordPiece("las", 0, 0, 41),), epoch_s=gps_shift_s)
+RECORD = RecordLayout(43, (RecordPiece("las", 0, 0, 43),), _PLAIN, gps_shift_s)
+
+
+def load_lazrs() -> ModuleType:
+    """Return the compressor; UsageError without it."""
+    try:
+        return importlib.import_module("lazrs")
+    except ImportError as err:
+        raise UsageError(
+            f"--format laz: expected the package lazrs, found none ({err}); {install_extra('las')}"
+        ) from err
+
+
+class LasEncoder:
+    """Encodes scans as LAS files, or as LAZ files by `lazrs`."""
+
+    def __init__(self, lazrs: ModuleType | None = None) -> None:
+        self._lazrs = lazrs
+        self._records = ScanRecords(RECORD)
+
+    def encode(self, scan: Scan) -> list[Bytes]:
+        """Return the file of a scan; ExportError where coordinates do not fit into int32."""
+        packed = self._records.of(scan)
+        records = record_bytes(packed)
+        point_bytes = (RECORD if scan.reflectivity is not None else _PLAIN).step
+        text = "\n".join(scan_comments(scan, "x y z m; gps_time s; time_ns ns after start_ns"))
+        vlrs = [
+            _vlr("LASF_Spec", 4, "Extra Bytes Record", _extra_bytes(records, point_bytes)),
+            _vlr(VLR_USER, VLR_NUMBER, "scan", text.encode()),
+        ]
+        if self._lazrs is None:
+            return [_header(scan, packed, vlrs, _POINT_FORMAT, point_bytes), records]
+        items = self._lazrs.LazVlr.new_for_compression(_POINT_FORMAT, point_bytes - 30)
+        vlrs.append(_vlr("laszip encoded", 22204, "http://laszip.org", items.record_data()))
+        stream = io.BytesIO()
+        stream.write(_header(scan, packed, vlrs, _POINT_FORMAT | _COMPRESSED, point_bytes))
+        # Threads come from --jobs.
+        compressor = self._lazrs.LasZipCompressor(stream, items)
+        if len(records):
+            compressor.compress_many(packed.buffer[packed.begin : packed.end])
+        compressor.done()
+        return [stream.getbuffer()]
+
+
+def _header(
+    scan: Scan, packed: PackedPoints, vlrs: list[bytes], point_format: int, point_bytes: int
+) -> bytes:
+    """Return a header and its variable length records."""
+    (count,) = packed.shape
+    second = 0
+    bounds = [0.0] * 6
+    if packed.totals is not None and count:
+        low_m, high_m, second = packed.totals
+        farthest_m = max(map(abs, (*low_m, *high_m)))
+        if farthest_m > _FARTHEST_M:
+            raise ExportError(
+                f"scan {scan.index}: expected coordinates up to {_FARTHEST_M:.0f} m for las and "
+                f"laz, found {farthest_m:.0f} m; write another format, or --max-range"
+            )
+        # Rounded as the coordinates, half to even.
+        ends = (end_m for ends_m in zip(high_m, low_m, strict=True) for end_m in ends_m)
+        bounds = [round(end_m / SCALE_M) * SCALE_M for end_m in ends]
+    is_standard = scan.info.timescale in (UTC, TAI)
+    # Equal runs give equal bytes: the day of the scan, not of the run.
+    day = datetime.fromtimestamp(scan.start_ns // NS_PER_S, timezone.utc).timetuple()
+    fields = [
+        *(b"LASF", 0, _WKT | (_STANDARD_TIME if is_standard else 0), b"", 1, 4),
+        *(b"mlbatch", f"mlbatch {mlbatch.__version__}".encode()),
+        *(day.tm_yday, day.tm_year),
+        *(_HEADER.size, _HEADER.size + sum(map(len, vlrs)), len(vlrs)),
+        *(point_format, point_bytes, *[0] * 6),
+        *(SCALE_M, SCALE_M, SCALE_M, 0.0, 0.0, 0.0, *bounds),
+        *(0, 0, 0, count, count - second, second, *[0] * 13),
+    ]
+    return b"".join([_HEADER.pack(*fields), *vlrs])
+
+
+def _vlr(user: str, number: int, description: str, content: bytes) -> bytes:
+    """Return a variable length record."""
+    head = _VLR.pack(0, user.encode(), number, len(content), description.encode())
+    return head + content
+
+
+def _extra_bytes(records: memoryview, point_bytes: int) -> bytes:
+    """Return the descriptions of the extra bytes.
+
+    Lowest and highest are those of the first point, as laspy has them, whatever the others are.
+    """
+    first: tuple[float, ...] = ()
+    if len(records):
+        first = _EXTRA_VALUES.unpack(bytes(records[:point_bytes]).ljust(_EXTRA_VALUES.size, b"\0"))
+    known = _EXTRA_BYTES if point_bytes == RECORD.step else _EXTRA_BYTES[:-1]
+    parts = []
+    for index, (name, kind, description, form) in enumerate(known):
+        low, high = (first[index],) * 2 if first else _NO_EXTREMES[form]
+        ends = (struct.pack(form, low), struct.pack(form, high))
+        parts.append(_EXTRA.pack(kind, _HAS_EXTREMES, name.encode(), *ends, description.encode()))
+    return b"".join(parts)

@@ -24,7 +24,6 @@ from mlbatch.types import (
     INSTANTS,
     ImuSamples,
     Message,
-    PackedPoints,
     RecordLayout,
     RunInfo,
     Scan,
@@ -34,7 +33,7 @@ from mlbatch.types import (
 from mlbatch.writers.atomic import SCANS_CSV, export_errors, prepare, side_path, write_text
 from mlbatch.writers.base import Checkpoint, ScanJob, WriterOptions, Written
 from mlbatch.writers.output_file import borrow, crc32
-from mlbatch.writers.point_layouts import CLOUD_LAYOUTS, Layout, Points, points_of
+from mlbatch.writers.point_layouts import CLOUD_LAYOUTS, Layout, ScanRecords
 
 # Limits of what waits for the first scan. Samples: minutes at the rates of built-in IMUs.
 WAITING_SAMPLES = 65536
@@ -237,9 +236,7 @@ class MessageWriter:
             columns = len(scan.column_stamp_ns)
             shape = (scan.points,) if dense else (scan.time_ns.shape[1], columns)
             return cloud, cloud.blank(shape, stamp_ns(scan))
-        if scan.packed is not None:
-            return cloud, cloud.around(scan.packed, stamp_ns(scan), dense)
-        return cloud, cloud.assemble(points_of(scan), stamp_ns(scan), dense)
+        return cloud, cloud.message(scan, stamp_ns(scan), dense)
 
     def send_scan(
         self, scan: Scan, sensor: int | None, message: memoryview, crc: int | None
@@ -378,29 +375,18 @@ class _CloudJob(ScanJob):
 
 
 class CloudMessage:
-    """Assembles sensor_msgs/PointCloud2 in one buffer that is reused for every scan."""
+    """Assembles sensor_msgs/PointCloud2 around the records of scans."""
 
     def __init__(self, layout: Layout, frame_id: str, wire: NewWire) -> None:
         self._layout = layout
         self._frame_id = frame_id
         self._wire = wire
-        self._dtype = layout.dtype
-        self._buffer = np.empty(0, dtype=np.uint8)
+        self._records = ScanRecords(layout)
+        self._blank = np.empty(0, dtype=np.uint8)
 
-    def assemble(self, points: Points, stamp_ns: int, dense: bool) -> memoryview:
-        """Return the message; it is valid until the next call."""
-        head = self._head(points.time_ns.shape, stamp_ns)
-        start = len(head)
-        end = start + points.time_ns.size * self._layout.step
-        self._fit(end + 1)
-        self._buffer[:start] = np.frombuffer(head, dtype=np.uint8)
-        records = self._buffer[start:end].view(self._dtype)
-        self._layout.pack(points, records.reshape(points.time_ns.shape))
-        self._buffer[end] = dense
-        return self._buffer[: end + 1].data
-
-    def around(self, packed: PackedPoints, stamp_ns: int, dense: bool) -> memoryview:
-        """Return the message of packed points, in their buffer; valid as long as that is."""
+    def message(self, scan: Scan, stamp_ns: int, dense: bool) -> memoryview:
+        """Return the message of a scan, in the buffer of its records: valid as long as that is."""
+        packed = self._records.of(scan)
         head = self._head(packed.shape, stamp_ns)
         buffer, start = packed.buffer, packed.begin - len(head)
         if start < 0:
@@ -415,13 +401,9 @@ class CloudMessage:
     def blank(self, shape: tuple[int, ...], stamp_ns: int) -> memoryview:
         """Return bytes as long as the message of a cloud of this shape, with any content."""
         total = len(self._head(shape, stamp_ns)) + math.prod(shape) * self._layout.step + 1
-        self._fit(total)
-        return self._buffer[:total].data
-
-    def _fit(self, total: int) -> None:
-        if len(self._buffer) < total:
-            # Zeros: padding between fields is never written.
-            self._buffer = np.zeros(total * 5 // 4, dtype=np.uint8)
+        if len(self._blank) < total:
+            self._blank = np.zeros(total * 5 // 4, dtype=np.uint8)
+        return self._blank[:total].data
 
     def _head(self, shape: tuple[int, ...], stamp_ns: int) -> bytearray:
         """Return the message up to its points; shape: (width,) or (height, width)."""

@@ -11,10 +11,11 @@ import pytest
 from mcap.reader import make_reader
 
 from mlbatch.pipeline import resume
+from mlbatch.types import Scan
 from mlbatch.verify.encoding import MessageCursor
 from mlbatch.verify.messages import read_cloud
 from mlbatch.writers.message_writer import CloudMessage
-from mlbatch.writers.point_layouts import CLOUD_LAYOUTS, Points, clipped_points, points_of
+from mlbatch.writers.point_layouts import CLOUD_LAYOUTS, clipped_points
 from tests.builders.captures import udp_frame, write_pcap
 from tests.builders.ouster import IntLike, OusterSpec, encode_packets
 from tests.builders.points import OUSTER, STAMP_NS, cloud_message, write_points
@@ -137,16 +138,16 @@ def test_a_resumed_run_counts_those_of_the_scans_before(
     monkeypatch.setattr(os, "sync", lambda: None)
     words = "convert drive.mcap --point-layout autoware --keep-partial"
     assert shell(f"{words} -o whole.mcap").code == 0
-    assemble = CloudMessage.assemble
+    message = CloudMessage.message
     calls = []
 
-    def failing(self: CloudMessage, points: Points, stamp_ns: int, dense: bool) -> memoryview:
+    def failing(self: CloudMessage, scan: Scan, stamp_ns: int, dense: bool) -> memoryview:
         calls.append(stamp_ns)
         if len(calls) == 6:
             raise KeyboardInterrupt
-        return assemble(self, points, stamp_ns, dense)
+        return message(self, scan, stamp_ns, dense)
 
-    monkeypatch.setattr(CloudMessage, "assemble", failing)
+    monkeypatch.setattr(CloudMessage, "message", failing)
     assert shell(f"{words} -o out.mcap").code == 130
     outcome = shell(f"{words} -o out.mcap --resume")
     assert (outcome.code, "resumed after" in outcome.err) == (0, True), outcome.err
@@ -179,6 +180,6 @@ def test_a_mixed_rig_takes_what_each_sensor_has() -> None:
         reflectivity=np.array([40, 0, 256, 0], np.uint16),
     )
     records = np.zeros(4, CLOUD_LAYOUTS["autoware"].dtype)
-    CLOUD_LAYOUTS["autoware"].pack(points_of(scan), records)
+    CLOUD_LAYOUTS["autoware"].pack(scan, records)
     assert records["intensity"].tolist() == [40, 255, 255, 8]
     assert clipped_points(scan) == [1, 1]

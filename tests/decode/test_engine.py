@@ -30,11 +30,19 @@ from mlbatch.pipeline.conversion import Conversion
 from mlbatch.sensors.ouster.profiles import PROFILES
 from mlbatch.sensors.ouster.sensor import read_calibration
 from mlbatch.types import EXTRAS, RecordLayout, RunInfo, SensorInfo
-from mlbatch.writers.point_layouts import CLOUD_LAYOUTS, PLY_LAYOUTS, Layout, points_of
+from mlbatch.writers.las_encoder import RECORD as LAS
+from mlbatch.writers.point_layouts import (
+    CLOUD_LAYOUTS,
+    PLY_LAYOUTS,
+    ROWS_KITTI,
+    ROWS_NUSCENES,
+    ROWS_TIME,
+)
 from tests.builders.engines import BOXES_M, MOST_COLUMNS, Pair
 from tests.builders.ouster import OusterSpec, metadata_json
 from tests.golden import test_every_model as models
 from tests.reference.decoder import readings_of, record_of
+from tests.reference.records import check_records
 
 START_NS = 1_800_000_000_000_000_000
 END_NS = 1_800_000_000_100_000_000
@@ -49,12 +57,14 @@ POSES = (
 NAMES = tuple(name for name in PROFILES if name != "OFF")
 GUARD_ROWS = 64
 GUARD = 0xA5
-# All layouts whose records the loops pack.
-PACKED = tuple(
-    layout
-    for layout in (*CLOUD_LAYOUTS.values(), *PLY_LAYOUTS.values())
+# All layouts whose records the loops pack, and the arrays that these need.
+PACKED = {
+    layout.name: (layout.record, layout.extras)
+    for layout in (
+        *(*CLOUD_LAYOUTS.values(), *PLY_LAYOUTS.values(), ROWS_KITTI, ROWS_NUSCENES, ROWS_TIME),
+    )
     if layout.record is not None
-)
+} | {"las": (LAS, frozenset({"reflectivity"}))}
 # Of all kinds of rotors and pixels.
 OTHERS = (
     (models.velodyne_sent, ("VLP-16", "dual")),
@@ -170,34 +180,37 @@ def words_of(lidar: Lidar, rng: np.random.Generator, count: int) -> I64Array:
 
 
 class Packing:
-    """Records that the loops pack, against those that the layout packs of arrays."""
+    """Records that the loops pack, against the literal ones of the points in arrays."""
 
     def __init__(
         self,
         info: RunInfo,
         sources: list[Source],
         boxes_m: npt.NDArray[np.float64],
-        layout: Layout,
+        name: str,
     ) -> None:
-        self._layout = layout
+        record, extras = PACKED[name]
+        self._name = name
         self._arrays, self._records = (
-            Decoder(info, sources, boxes_m, layout.extras, record=record)
-            for record in (None, layout.record)
+            Decoder(info, sources, boxes_m, extras, record=chosen) for chosen in (None, record)
         )
 
     def check(self, columns: WindowColumns, header: ScanHeader) -> None:
-        """Decode a window by both; the records have the same bytes."""
+        """Decode a window by both."""
         scan = self._arrays.scan(columns, header)
         found = self._records.scan(columns, header)
         assert scan.packed is None
         assert found.packed is not None
-        points = points_of(scan)
-        expected = np.zeros(points.time_ns.shape, self._layout.dtype)
-        self._layout.pack(points, expected)
         packed = found.packed
-        assert packed.shape == expected.shape
-        assert packed.buffer[packed.begin : packed.end].tobytes() == expected.tobytes()
+        assert packed.shape == scan.time_ns.T.shape
+        records = packed.buffer[packed.begin : packed.end].tobytes()
+        check_records(records, scan, self._name, seed=len(columns))
         assert self._arrays.counts == self._records.counts
+        if packed.totals is not None and scan.points:
+            assert packed.totals.low_m == tuple(scan.xyz.min(axis=0).tolist())
+            assert packed.totals.high_m == tuple(scan.xyz.max(axis=0).tolist())
+            farther = int(np.isin(scan.return_type, (4, 6)).sum())
+            assert packed.totals.second_returns == farther
 
 
 def check(lidars: list[Lidar], case: Case) -> None:
@@ -216,7 +229,8 @@ def check(lidars: list[Lidar], case: Case) -> None:
         base += lidar.channels
     info = RunInfo(tuple(infos), "base_link", "10", "utc", 1, case.layout)
     pair = Pair(info, sources, boxes_m, case.extras)
-    packing = Packing(info, sources, boxes_m, PACKED[case.seed % len(PACKED)])
+    names = [name for name in PACKED if name != "las" or case.layout == "dense"]
+    packing = Packing(info, sources, boxes_m, names[case.seed % len(names)])
     for _ in range(2):
         sensor = rng.integers(0, len(lidars), case.columns)
         place, word = np.empty((2, case.columns), np.int64)
@@ -338,7 +352,7 @@ def test_nothing_is_written_beyond_the_arrays(
 
 
 @pytest.mark.parametrize("layout", ["dense", "organized"])
-@pytest.mark.parametrize("number", range(len(PACKED)), ids=[layout.name for layout in PACKED])
+@pytest.mark.parametrize("number", range(len(PACKED)), ids=list(PACKED))
 def test_records_of_every_layout(layout: str, number: int, others: list[Lidar]) -> None:
     alike = [ouster("RNG15_RFL8_NIR8", 32, 1), ouster("RNG15_RFL8_NIR8", 32, 2)]
     dual = ouster("RNG19_RFL8_SIG16_NIR16_DUAL", 16)

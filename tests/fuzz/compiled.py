@@ -108,7 +108,8 @@ def _pair(
     run = RunInfo((info,), "base_link", "10", "utc", 1, layout)
     boxes_m = np.array(BOXES_M if is_cut else ()).reshape(-1, 6)
     if is_packed:
-        return Packing(run, sources, boxes_m, PACKED[number % len(PACKED)]), ring
+        names = [name for name in PACKED if name != "las" or layout == "dense"]
+        return Packing(run, sources, boxes_m, names[number % len(names)]), ring
     return Pair(run, sources, boxes_m, EXTRAS), ring
 
 

@@ -13,7 +13,6 @@ import pytest
 from mlbatch.errors import ExportError
 from mlbatch.types import Scan
 from mlbatch.writers import WriterOptions, open_writer
-from mlbatch.writers.las_encoder import gps_time_s
 from tests.builders.scans import START_NS, SUMMARY, dense_scan, point_scan, run_job
 
 laspy = pytest.importorskip("laspy")
@@ -103,9 +102,9 @@ def test_gps_time_of_other_clocks(timescale: str, shift_s: int, tmp_path: Path) 
     scan = dense_scan()
     scan = replace(scan, info=scan.info._replace(timescale=timescale))
     expected = [(START_NS + shift_s * 10**9 + int(time)) / 10**9 for time in scan.time_ns]
-    np.testing.assert_allclose(gps_time_s(scan), expected, rtol=0, atol=3e-7)
-    header = written(tmp_path / "out", scan).header
-    standard = header.global_encoding.gps_time_type == laspy.header.GpsTimeType.STANDARD
+    las = written(tmp_path / "out", scan)
+    np.testing.assert_allclose(las.gps_time, expected, rtol=0, atol=3e-7)
+    standard = las.header.global_encoding.gps_time_type == laspy.header.GpsTimeType.STANDARD
     assert standard == (shift_s != 0)
 
 

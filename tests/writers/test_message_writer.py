@@ -14,7 +14,7 @@ from mlbatch.ros.encoding import Cdr
 from mlbatch.types import IMU, PACKED_ROOM, Message, PackedPoints, Summary
 from mlbatch.writers import WriterOptions, extras, format_names, open_writer, plugin
 from mlbatch.writers.message_writer import CloudMessage, quaternion, static_edges
-from mlbatch.writers.point_layouts import CLOUD_LAYOUTS, points_of
+from mlbatch.writers.point_layouts import CLOUD_LAYOUTS
 from tests.builders.scans import (
     PERIOD_NS,
     START_NS,
@@ -237,10 +237,10 @@ def test_quaternions_rotate_vectors_as_their_matrix() -> None:
 def test_packed_points_become_the_message_of_arrays(frame: str) -> None:
     scan = dense_scan()
     layout = CLOUD_LAYOUTS["standard"]
-    points = points_of(scan)
     end = PACKED_ROOM + scan.points * layout.step
     buffer = np.zeros(end + 1, np.uint8)
-    layout.pack(points, buffer[PACKED_ROOM:end].view(layout.dtype))
+    layout.pack(scan, buffer[PACKED_ROOM:end].view(layout.dtype))
     packed = PackedPoints(buffer, PACKED_ROOM, end, (scan.points,))
     cloud = CloudMessage(layout, frame, Cdr)
-    assert cloud.around(packed, 5, True).tobytes() == cloud.assemble(points, 5, True).tobytes()
+    from_arrays = cloud.message(scan, 5, True).tobytes()
+    assert cloud.message(replace(scan, packed=packed), 5, True).tobytes() == from_arrays

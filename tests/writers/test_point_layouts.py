@@ -1,4 +1,4 @@
-"""Point records: presets by hand, times, and fields that are copied as one word."""
+"""Point records: presets by hand, times, and arrays of any form against literal records."""
 
 from __future__ import annotations
 
@@ -12,18 +12,28 @@ import pytest
 
 from mlbatch.decode.scan_buffer import ScanBuffer
 from mlbatch.types import RecordLayout, RecordPiece, Scan
-from mlbatch.writers.point_layouts import CLOUD_LAYOUTS, PLY_LAYOUT, Records, points_of
+from mlbatch.writers.point_layouts import (
+    CLOUD_LAYOUTS,
+    PLY_LAYOUTS,
+    ROWS_NUSCENES,
+    ROWS_TIME,
+    Records,
+)
 from tests.builders.scans import dense_scan, organized_scan, point_scan
+from tests.reference.records import check_records
 
 SCANS: dict[str, Callable[[], Scan]] = {"dense": dense_scan, "organized": organized_scan}
-LAYOUTS = {layout.name: layout for layout in (*CLOUD_LAYOUTS.values(), PLY_LAYOUT)}
+LAYOUTS = {
+    layout.name: layout
+    for layout in (*CLOUD_LAYOUTS.values(), *PLY_LAYOUTS.values(), ROWS_NUSCENES, ROWS_TIME)
+}
 SPARE = 7
 
 
 def packed(scan: Scan, name: str) -> Records:
     """Return the records of a scan."""
     records = np.zeros(scan.time_ns.T.shape, LAYOUTS[name].dtype)
-    LAYOUTS[name].pack(points_of(scan), records)
+    LAYOUTS[name].pack(scan, records)
     return records
 
 
@@ -101,40 +111,27 @@ def side_by_side(scan: Scan) -> Scan:
 @pytest.mark.parametrize("name", LAYOUTS)
 @pytest.mark.parametrize("kind", SCANS)
 @pytest.mark.parametrize("begin", [0, 3])
-def test_wide_copies_change_nothing(kind: str, name: str, begin: int) -> None:
-    """For any alignment of the first record."""
+def test_arrays_are_packed_wherever_they_are(kind: str, name: str, begin: int) -> None:
+    """Side by side, apart or in larger items; for any alignment of the first record."""
     scan = SCANS[kind]()
     layout = LAYOUTS[name]
-    apart = points_of(scan)
-    together = points_of(side_by_side(scan))
-    assert (apart.reals is None, apart.labels is None) == (True, True)
-    assert together.reals is not None
-    assert together.labels is not None
+    together = side_by_side(scan)
+    spread = replace(
+        scan,
+        xyz=np.stack([scan.xyz, scan.xyz], axis=-1)[..., 0],
+        time_ns=np.repeat(scan.time_ns, 2, axis=0)[::2],
+        ring=scan.ring.astype(">u2"),
+    )
+    swapped = replace(together, lidar_id=together.lidar_id.copy())
     found = []
-    for points in (apart, together):
-        room = np.zeros(points.time_ns.size * layout.step + begin, np.uint8)
-        records = room[begin:].view(layout.dtype).reshape(points.time_ns.shape)
-        layout.pack(points, records)
+    for one in (scan, together, spread, swapped):
+        room = np.zeros(one.time_ns.size * layout.step + begin, np.uint8)
+        records = room[begin:].view(layout.dtype).reshape(one.time_ns.T.shape)
+        layout.pack(one, records)
         found.append(room.tobytes())
-    assert found[0] == found[1]
-    for axis, letter in enumerate("xyz"):
-        np.testing.assert_array_equal(records[letter], apart.xyz[..., axis])
-    if "lidar_id" in (layout.dtype.names or ()):
-        for field in ("intensity", "ring", "return_type", "lidar_id"):
-            np.testing.assert_array_equal(records[field], getattr(apart, field))
-
-
-def test_arrays_that_are_not_side_by_side() -> None:
-    scan = side_by_side(dense_scan())
-    assert points_of(replace(scan, intensity=scan.intensity.copy())).reals is None
-    assert points_of(replace(scan, xyz=scan.xyz.copy())).reals is None
-    assert points_of(replace(scan, ring=scan.ring.copy())).labels is None
-    later = {name: getattr(scan, name)[1:] for name in ("xyz", "intensity")}
-    assert points_of(replace(scan, **later)).reals is None
-    every = {name: getattr(scan, name)[::2] for name in ("xyz", "intensity")}
-    assert points_of(replace(scan, **every)).reals is None
-    swapped = replace(scan, return_type=scan.lidar_id, lidar_id=scan.return_type)
-    assert points_of(swapped).labels is None
+    assert len(set(found)) == 1
+    if name != "autoware":
+        check_records(found[0][begin:], scan, name, seed=begin)
 
 
 def test_no_points() -> None:

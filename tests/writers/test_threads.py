@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from mlbatch.errors import UsageError
-from mlbatch.writers import threads
+from mlbatch.writers import plugin, threads
 from mlbatch.writers.base import WriterOptions
 from mlbatch.writers.threads import jobs_for, parse_jobs
 
@@ -33,7 +33,7 @@ def test_other_texts_are_refused(text: str) -> None:
         ("mcap", SLOW, 3, 3),
         ("rosbag2", SLOW, 8, 4),
         ("laz", FAST, 2, 1),
-        ("las", FAST, 64, 4),
+        ("las", FAST, 64, 1),
     ],
 )
 def test_several_jobs_where_writing_is_slow(
@@ -42,3 +42,9 @@ def test_several_jobs_where_writing_is_slow(
     monkeypatch.setattr(threads, "_cores", lambda: cores)
     assert jobs_for(None, name, options) == jobs
     assert jobs_for(5, name, options) == 5
+
+
+def test_a_format_may_be_slow(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(threads, "_cores", lambda: 64)
+    monkeypatch.setattr(plugin("npz"), "IS_SLOW", True, raising=False)
+    assert jobs_for(None, "npz", FAST) == 4

@@ -8,9 +8,10 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from mlbatch.types import RunInfo
+from mlbatch.types import RecordLayout, RunInfo
 from mlbatch.writers.base import ScanWriter, WriterOptions
-from mlbatch.writers.float_rows import TIMES_TXT, XYZI, RowEncoder, times_text
+from mlbatch.writers.float_rows import TIMES_TXT, RowEncoder, times_text
+from mlbatch.writers.point_layouts import ROWS_KITTI
 from mlbatch.writers.scan_folder import FolderWriter, check_dense
 
 FORMAT = "kitti"
@@ -24,6 +25,11 @@ def extras(options: WriterOptions) -> frozenset[str]:
     return frozenset()
 
 
+def record_layout(options: WriterOptions) -> RecordLayout | None:
+    """Return the rows."""
+    return ROWS_KITTI.record
+
+
 def open_writer(target: Path, info: RunInfo, options: WriterOptions) -> ScanWriter:
     """Start a folder of .bin files."""
     check_dense(FORMAT, info)
@@ -33,7 +39,7 @@ def open_writer(target: Path, info: RunInfo, options: WriterOptions) -> ScanWrit
         info,
         options,
         FORMAT,
-        lambda: RowEncoder(XYZI),
+        lambda: RowEncoder(ROWS_KITTI),
         suffix=suffix,
         lists={TIMES_TXT: times_text},
     )

@@ -1,16 +1,16 @@
 """A folder of LAZ files: LAS, compressed by lazrs; needs the extra `las`.
 
 Source: ASPRS, "LAS specification 1.4 R15" (point data record format 6, extra bytes), and
-docs/sources/outputs.md section 6. Compression: LASzip, as in laspy.
+docs/sources/outputs.md section 6. Compression: LASzip.
 """
 
 from __future__ import annotations
 
 from pathlib import Path
 
-from mlbatch.types import RunInfo
+from mlbatch.types import RecordLayout, RunInfo
 from mlbatch.writers.base import ScanWriter, WriterOptions
-from mlbatch.writers.las_encoder import LAS_EXTRAS, LasEncoder, load_laspy
+from mlbatch.writers.las_encoder import LAS_EXTRAS, RECORD, LasEncoder, load_lazrs
 from mlbatch.writers.scan_folder import FolderWriter, check_dense
 
 FORMAT = "laz"
@@ -23,8 +23,13 @@ def extras(options: WriterOptions) -> frozenset[str]:
     return LAS_EXTRAS
 
 
+def record_layout(options: WriterOptions) -> RecordLayout | None:
+    """Return the records of all points."""
+    return RECORD
+
+
 def open_writer(target: Path, info: RunInfo, options: WriterOptions) -> ScanWriter:
     """Start a folder of LAZ files."""
     check_dense(FORMAT, info)
-    laspy = load_laspy(FORMAT)
-    return FolderWriter(target, info, options, FORMAT, lambda: LasEncoder(laspy, compresses=True))
+    lazrs = load_lazrs()
+    return FolderWriter(target, info, options, FORMAT, lambda: LasEncoder(lazrs))

@@ -12,13 +12,8 @@ from pathlib import Path
 
 from mlbatch.types import RunInfo
 from mlbatch.writers.base import ScanWriter, WriterOptions
-from mlbatch.writers.float_rows import (
-    TIME_AND_LIDAR,
-    TIMES_TXT,
-    XYZIR,
-    RowEncoder,
-    times_text,
-)
+from mlbatch.writers.float_rows import TIMES_TXT, RowEncoder, times_text
+from mlbatch.writers.point_layouts import ROWS_NUSCENES, ROWS_TIME
 from mlbatch.writers.scan_folder import FolderWriter, check_dense
 
 FORMAT = "nuscenes"
@@ -41,8 +36,8 @@ def open_writer(target: Path, info: RunInfo, options: WriterOptions) -> ScanWrit
         info,
         options,
         FORMAT,
-        lambda: RowEncoder(XYZIR),
+        lambda: RowEncoder(ROWS_NUSCENES),
         suffix=points,
-        others={times: lambda: RowEncoder(TIME_AND_LIDAR)},
+        others={times: lambda: RowEncoder(ROWS_TIME)},
         lists={TIMES_TXT: times_text},
     )

@@ -13,7 +13,7 @@ import numpy as np
 from mlbatch.types import RecordLayout, RunInfo, Scan
 from mlbatch.writers.base import DEFAULT_POINT_LAYOUT, ScanWriter, WriterOptions
 from mlbatch.writers.output_file import Bytes
-from mlbatch.writers.point_layouts import CLOUD_LAYOUTS, points_of
+from mlbatch.writers.point_layouts import CLOUD_LAYOUTS, ScanRecords, record_bytes
 from mlbatch.writers.scan_comments import scan_comments
 from mlbatch.writers.scan_folder import FolderWriter
 
@@ -42,25 +42,16 @@ def open_writer(target: Path, info: RunInfo, options: WriterOptions) -> ScanWrit
 
 
 class PcdEncoder:
-    """Encodes scans in a buffer of points that is reused."""
+    """Encodes scans as a header and records."""
 
     def __init__(self) -> None:
-        self._records = np.zeros(0, dtype=_LAYOUT.dtype)
+        self._records = ScanRecords(_LAYOUT)
 
     def encode(self, scan: Scan) -> list[Bytes]:
         """Return the header and all points; an organized scan has a row for each slot."""
-        if scan.packed is not None:
-            shape = scan.packed.shape
-            packed = scan.packed.buffer[scan.packed.begin : scan.packed.end].data
-            return [_header(scan, shape[-1], _height(shape)).encode(), packed]
-        points = points_of(scan)
-        shape = points.time_ns.shape
-        count = points.time_ns.size
-        if len(self._records) < count:
-            self._records = np.zeros(count * 5 // 4, dtype=_LAYOUT.dtype)
-        records = self._records[:count]
-        _LAYOUT.pack(points, records.reshape(shape))
-        return [_header(scan, shape[-1], _height(shape)).encode(), records.view(np.uint8).data]
+        packed = self._records.of(scan)
+        shape = packed.shape
+        return [_header(scan, shape[-1], _height(shape)).encode(), record_bytes(packed)]
 
 
 def _height(shape: tuple[int, ...]) -> int:

@@ -8,12 +8,10 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import numpy as np
-
 from mlbatch.types import RecordLayout, RunInfo, Scan
 from mlbatch.writers.base import ScanWriter, WriterOptions
 from mlbatch.writers.output_file import Bytes
-from mlbatch.writers.point_layouts import PLY_LAYOUTS, Layout, points_of
+from mlbatch.writers.point_layouts import PLY_LAYOUTS, Layout, ScanRecords, record_bytes
 from mlbatch.writers.scan_comments import scan_comments
 from mlbatch.writers.scan_folder import FolderWriter, check_dense
 
@@ -43,23 +41,16 @@ def open_writer(target: Path, info: RunInfo, options: WriterOptions) -> ScanWrit
 
 
 class PlyEncoder:
-    """Encodes scans in a buffer of vertices that is reused."""
+    """Encodes scans as a header and vertices."""
 
     def __init__(self, layout: Layout) -> None:
         self._layout = layout
-        self._vertices = np.zeros(0, dtype=layout.dtype)
+        self._vertices = ScanRecords(layout)
 
     def encode(self, scan: Scan) -> list[Bytes]:
         """Return the header and all points as vertices."""
-        count = scan.points
-        if scan.packed is not None:
-            packed = scan.packed.buffer[scan.packed.begin : scan.packed.end].data
-            return [self._header(scan, count).encode(), packed]
-        if len(self._vertices) < count:
-            self._vertices = np.zeros(count * 5 // 4, dtype=self._layout.dtype)
-        vertices = self._vertices[:count]
-        self._layout.pack(points_of(scan), vertices)
-        return [self._header(scan, count).encode(), vertices.view(np.uint8).data]
+        packed = self._vertices.of(scan)
+        return [self._header(scan, packed.shape[0]).encode(), record_bytes(packed)]
 
     def _header(self, scan: Scan, count: int) -> str:
         """Return the header of a PLY file of `count` vertices."""
