@@ -336,6 +336,8 @@ def checked_rule(
         # Refused with its values when a cloud is read.
         return rule, notes
     share = span * found_unit.unit_ns / spacing_ns
+    if "unit" in rule.places:
+        _refuse_unit(name, span, spacing_ns, found_unit.unit_ns, rule)
     shown = f"{span * found_unit.unit_ns / NS_PER_MS:.3f} ms in messages {apart.strip(' ()')} apart"
     if share < _LEAST_SPAN and "unit" not in rule.places:
         raise CloudError(
@@ -422,6 +424,23 @@ def _inferred(
         f"{{unit: {unit}}}), or leave the topic out with --ignore {topic}"
     )
     return replace(rule, unit_ns=unit_ns, inferred=text), _by_unit(high, unit_ns)
+
+
+def _refuse_unit(name: str, span: float, spacing_ns: float, unit_ns: int, rule: PointRule) -> None:
+    """Refuse a unit of the rig by which no sweep is a revolution, where another one fits."""
+    share = span * unit_ns / spacing_ns
+    if _LEAST_SPAN <= share <= _MOST_SPAN:
+        return
+    # A sector may be short, but several sweeps in one message have times of any length.
+    least = _LEAST_SPAN if share < _LEAST_SPAN else _SWEEP[0]
+    for unit, other_ns in UNITS_NS.items():
+        if least <= span * other_ns / spacing_ns <= _SWEEP[1]:
+            raise CloudError(
+                f"{rule.at('unit')}field {name}: expected times of points that span about the "
+                f"spacing of the messages ({spacing_ns / NS_PER_MS:.3f} ms), found "
+                f"{span * unit_ns / NS_PER_MS:.6g} ms by unit: {_unit_name(unit_ns)}; write unit: "
+                f"{unit}, by which they span {span * other_ns / NS_PER_MS:.6g} ms"
+            )
 
 
 def _against_log_times(

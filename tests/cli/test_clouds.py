@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -513,6 +514,33 @@ def test_times_below_half_of_the_spacing_are_warned_about(shell: Shell) -> None:
     clouds = _bag(_clouds(OUSTER, [n * MS for n in range(51)]))
     outcome = _run(shell, clouds, "--strict", rig=_rig("{from: start}"))
     assert outcome.code == 0, outcome.err
+
+
+@pytest.mark.parametrize(
+    ("fields", "times", "stated", "span_ms", "right"),
+    [
+        (OUSTER, US, "ns", "0.097", "us"),
+        (OUSTER, NS, "us", "97000", "ns"),
+        (OUSTER, NS, "ms", "9.7e+07", "ns"),
+        (VELODYNE, SECONDS, "ms", "0.097", "s"),
+        (VELODYNE, SECONDS, "us", "9.7e-05", "s"),
+        # A quarter of a revolution.
+        (OUSTER, US[:25], "ns", "0.024", "us"),
+    ],
+)
+def test_a_stated_unit_that_is_wrong_is_refused(
+    shell: Shell, fields: Fields, times: Sequence[float], stated: str, span_ms: str, right: str
+) -> None:
+    outcome = _run(shell, _bag(_clouds(fields, times)), rig=_rig(f"{{unit: {stated}}}"))
+    assert (outcome.code, outcome.out) == (1, "")
+    assert re.fullmatch(
+        r"mlbatch: error: .*rig\.yaml:4: sensors\[0\]\.points\.unit: field \w+ \(\w+\): expected "
+        r"times of points that span about the spacing of the messages \(100\.000 ms\), found "
+        rf"{re.escape(span_ms)} ms by unit: {stated}; write unit: {right}, by which they span "
+        rf"{len(times) - 1} ms.*\n",
+        outcome.err,
+    )
+    assert _run(shell, _bag(_clouds(fields, times)), rig=_rig(f"{{unit: {right}}}")).code == 0
 
 
 def test_absolute_times_can_be_stated(shell: Shell, tmp_path: Path) -> None:
