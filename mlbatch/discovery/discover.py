@@ -17,6 +17,7 @@ from mlbatch.arrays import BoolArray, F64Array, U8Array
 from mlbatch.clocks.compare import COMPARABLE_NS, refuse_incomparable
 from mlbatch.clocks.timescale import gps_utc_s, tai_utc_s
 from mlbatch.discovery.extrinsics import place
+from mlbatch.discovery.gravity import gravity_notes
 from mlbatch.discovery.interleaved import shared_address
 from mlbatch.discovery.match import (
     ExpectedSensor,
@@ -220,10 +221,12 @@ def discover(
         if not sensor.kinds:
             text = "no packet of it in the first 10 seconds"
             notes.append(Note("not_seen_yet", sensor.name, text))
+    router = Router(table, chosen, sampler.kinds)
+    notes += gravity_notes(sampler, router, chosen, extrinsics.body_frame)
     return Discovery(
         sensors=chosen,
         frame_id=extrinsics.body_frame,
-        router=Router(table, chosen, sampler.kinds),
+        router=router,
         sampler=sampler,
         recordings=recordings,
         examined=examined,

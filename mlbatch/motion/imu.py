@@ -8,6 +8,7 @@ errors of the accelerometer; within a window only its product with 0.1 s matters
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,6 +18,7 @@ from mlbatch.errors import RecordingError
 from mlbatch.frames.transforms import inverse
 from mlbatch.motion.se3 import exp_rotation, rotated
 from mlbatch.motion.track import MAX_GAP_NS, PoseTrack
+from mlbatch.types import ImuSamples
 from mlbatch.units import NS_PER_MS, NS_PER_S, STANDARD_GRAVITY
 
 STANDSTILL_NS = NS_PER_S
@@ -82,16 +84,33 @@ def standstill(stamp_ns: I64Array, force: F64Array, rate: F64Array, name: str) -
     return Standstill(bias, gravity, int(np.median(np.diff(stamp_ns[rows]))))
 
 
+def mean_gravity(parts: Sequence[ImuSamples]) -> F64Array | None:
+    """Mean specific force (3,), m/s2, IMU frame, of samples; None if that is not gravity alone."""
+    stamp_ns = np.concatenate([part.stamp_ns for part in parts])
+    if len(stamp_ns) < _LEAST_SAMPLES or np.ptp(stamp_ns) < STANDSTILL_NS:
+        return None
+    force: F64Array = np.concatenate([part.acceleration for part in parts]).mean(axis=0)
+    rate = np.concatenate([part.angular_velocity for part in parts]).mean(axis=0)
+    off = abs(float(np.linalg.norm(force)) / STANDARD_GRAVITY - 1.0)
+    turns = float(np.linalg.norm(rate)) > _MOST_BIAS
+    return None if off > _GRAVITY_TOLERANCE or turns else force
+
+
+def tilt_deg(up: F64Array, vertical: F64Array) -> float:
+    """Angle between two vectors (3,); rounded, so that a slope of 30 degrees is not one more."""
+    across = float(np.linalg.norm(np.cross(vertical, up)))
+    return round(math.degrees(math.atan2(across, float(vertical @ up))), 6)
+
+
 def check_upright(up: F64Array, name: str) -> None:
     """RecordingError unless a specific force at rest (3,), body frame, points along z."""
-    tilt_deg = math.degrees(math.atan2(math.hypot(up[0], up[1]), up[2]))
-    # Rounded, so that a slope of just as much is not one more.
-    if round(tilt_deg, 6) > MOST_TILT_DEG:
+    tilted_deg = tilt_deg(up, np.array([0.0, 0.0, 1.0]))
+    if tilted_deg > MOST_TILT_DEG:
         found = " ".join(f"{value:.1f}" for value in up)
         raise RecordingError(
             f"{name}: expected +{STANDARD_GRAVITY:.2f} m/s2 within {MOST_TILT_DEG:.0f} degrees of "
-            f"the body's z axis at rest, found {found} m/s2, {tilt_deg:.0f} degrees from it; check "
-            "the sign of the accelerometer and the extrinsics of the IMU"
+            f"the body's z axis at rest, found {found} m/s2, {tilted_deg:.0f} degrees from it; "
+            "check the sign of the accelerometer and the extrinsics of the IMU"
         )
 
 
