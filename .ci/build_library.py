@@ -18,8 +18,12 @@ from typing import Any
 
 from hatchling.builders.hooks.plugin.interface import BuildHookInterface
 
-# No contraction of products and sums: every compiler and processor gives the same bytes.
-FLAGS = ("-std=c11", "-O3", "-ffp-contract=off", "-fvisibility=hidden", "-fPIC", "-shared")
+# No contraction of products and sums: every compiler and processor gives the same bytes. Square
+# roots without errno, so that compilers make vectors of them.
+FLAGS = (
+    *("-std=c11", "-O3", "-ffp-contract=off", "-fno-math-errno"),
+    *("-fvisibility=hidden", "-fPIC", "-shared"),
+)
 ZIG = "ziglang>=0.13"
 LIBRARY = "mlbatch/native/_native.so"
 

@@ -67,7 +67,6 @@ class Engine:
             group = SensorGroup(
                 [(first_sensor + number, sources[number]) for number in numbers],
                 self._structs[which],
-                is_dense=not organized_slots,
                 has_reflectivity="reflectivity" in extras,
             )
             self._groups.append(group)

@@ -36,7 +36,6 @@ _WORD_BYTES = 4
 _COUNTS = 5
 # Beams of a plane are a multiple of this.
 _BEAMS_TOGETHER = 16
-_BEAMS_OF_FOUR = 4
 _FIELD_BITS = {"u1": 8, "<u2": 16, ">u2": 16, "<u4": 32}
 # Bits of all vectors of directions; `Group.used`.
 _ALL_DIRECTIONS = 0o77
@@ -55,12 +54,11 @@ class SensorGroup:
         members: Sequence[tuple[int, Source]],
         struct: Group,
         *,
-        is_dense: bool,
         has_reflectivity: bool,
     ) -> None:
         """members: with equal `group_key`, index in the scan and source of each; struct: to fill.
 
-        is_dense: of dense scans; has_reflectivity: the scan has an array of them.
+        has_reflectivity: the scan has an array of them.
         """
         self.struct = struct
         self.counts = [PointCounts() for _ in members]
@@ -75,7 +73,6 @@ class SensorGroup:
         self._ring_structs = (Ring * len(members))()
         self._counts = np.zeros((len(members), _COUNTS), np.int64)
         geometries = [geometry(source) for source in self._sources]
-        first = geometries[0]
         struct.rings = ctypes.addressof(self._ring_structs)
         struct.beams = self._lidar.channels
         struct.width = self._width
@@ -84,18 +81,9 @@ class SensorGroup:
         struct.counts = self._kept(self._counts)
         self._order = _firing_order(self._lidar)
         table = self._lidar.pixels
-        by_beams = isinstance(first, BeamTable)
-        # Of the pixels of a column, in order of output; None: beams are in wire order.
-        self._places = None
         if table is not None:
             _require_inside(self._lidar, table)
-            if is_dense and by_beams:
-                self._places = _places(self._lidar, self._order, table)
             self._set_pixels(table, has_reflectivity)
-            fits = by_beams and (self._places is not None or self._fits_fours(table))
-            struct.fits_fours = fits
-        if self._places is not None:
-            struct.places = self._kept(self._places)
         self._set_geometry(geometries)
         self._set_slots()
         self._set_labels(members)
@@ -166,25 +154,18 @@ class SensorGroup:
         struct.fields = ctypes.addressof(structs)
         struct.scale = self._kept(np.array([table.factor, table.divisor], np.float32))
         struct.silent = table.silent
-        struct.dark_count = len(table.dark)
-        struct.dark = self._kept(np.array(table.dark, np.int64))
+        is_dark = np.ones(self._lidar.channels, np.bool_)
+        for run in table.returns[0].runs:
+            is_dark[run.channel : run.channel + run.channels] = False
+        is_dark[list(table.dark)] = True
+        dark = is_dark.nonzero()[0]
+        struct.dark_count = len(dark)
+        struct.dark = self._kept(dark)
         struct.has_reflectivity = (
             self._lidar.has_reflectivity
             and has_reflectivity
             and table.returns[0].reflectivity is not None
         )
-
-    def _fits_fours(self, table: PixelTable) -> bool:
-        """Return whether the beams of a column can be decoded four at a time, in wire order."""
-        lidar = self._lidar
-        if lidar.returns > 1 or self._order is not None or table.dark:
-            return False
-        channel = 0
-        for run in table.returns[0].runs:
-            if run.channel != channel or run.channels % _BEAMS_OF_FOUR:
-                return False
-            channel += run.channels
-        return channel == lidar.channels == self._slots
 
     # -- geometry --
 
@@ -284,9 +265,7 @@ class SensorGroup:
         return np.maximum(lidar.firing_ns, 0).astype(np.float32)
 
     def _beams(self, values: F32Array) -> F32Array:
-        """Return values by beam (the last axis) in the order of the loops, padded to planes."""
-        if self._places is not None and self._order is not None:
-            values = values.take(self._order[0], axis=-1)
+        """Return values by beam (the last axis), padded to planes."""
         missing = self._width - values.shape[-1]
         return np.pad(values, [(0, 0)] * (values.ndim - 1) + [(0, missing)]) if missing else values
 
@@ -303,14 +282,8 @@ class SensorGroup:
             )
         number = np.zeros(lidar.returns * self._width, np.int64)
         number[element] = slot
-        # Slots that are beams are written by fours.
-        table = lidar.pixels
-        fits = table is not None and struct.fits_fours and self._fits_fours(table)
-        is_beam = fits and np.array_equal(slot, element)
-        struct.slot = None if is_beam else self._kept(number)
-        if self._places is not None:
-            struct.order = None
-        elif self._order is not None:
+        struct.slot = None if np.array_equal(slot, element) else self._kept(number)
+        if self._order is not None:
             struct.order = self._kept(element[self._order])
         elif lidar.returns > 1:
             struct.order = self._kept(element)
@@ -318,7 +291,8 @@ class SensorGroup:
         struct.order_step = self._slots if has_orders else 0
         struct.typed = self._typed_by
         struct.sends_twice = lidar.sends_twice
-        struct.drops_repeated = lidar.sends_twice and not self._sources[0].keep_repeated
+        is_repeated = lidar.sends_twice and lidar.returns > 1
+        struct.drops_repeated = is_repeated and not self._sources[0].keep_repeated
 
     def _set_labels(self, members: Sequence[tuple[int, Source]]) -> None:
         """Set words of labels of columns at time 0, (members * T, E)."""
@@ -329,8 +303,6 @@ class SensorGroup:
         if self._typed_by:
             # The loops add the types of dual returns.
             words &= ~_TYPE_BITS
-        if self._places is not None and self._order is not None:
-            words = words.take(self._order[0], axis=1)
         labels = np.zeros((len(words), self._lidar.returns * self._width), np.int64)
         labels[:, self._elements()] = words.view(np.int64)
         self.struct.labels = self._kept(labels)
@@ -416,7 +388,7 @@ def _labels(source: Source, lidar_id: int) -> npt.NDArray[np.void]:
 
 def _require_inside(lidar: Lidar, table: PixelTable) -> None:
     """Raise RigError unless all pixels are inside of the records and of the channels."""
-    runs = {len(layout.runs) for layout in table.returns}
+    runs = {tuple((run.channel, run.channels) for run in layout.runs) for layout in table.returns}
     is_known = (
         len(table.returns) == lidar.returns <= _MOST_RETURNS
         and _width(lidar) <= _MOST_BEAMS
@@ -443,22 +415,6 @@ def _is_inside(lidar: Lidar, table: PixelTable, layout: ReturnLayout) -> bool:
         and run.channel + run.channels <= lidar.channels
         for run in layout.runs
     )
-
-
-def _places(lidar: Lidar, order: I64Array | None, table: PixelTable) -> I64Array | None:
-    """Return first bytes of the pixels of a column in order of output: (slots,); `Group.places`.
-
-    None for wire order, and where the loops decode columns in passes.
-    """
-    if lidar.returns > 1 or order is None or len(order) > 1 or table.dark:
-        return None
-    if lidar.has_reflectivity or lidar.channels % _BEAMS_OF_FOUR:
-        return None
-    place = np.full(lidar.channels, -1, np.int64)
-    for run in table.returns[0].runs:
-        pixels = np.arange(run.channels)
-        place[run.channel + pixels] = run.first_byte + pixels * table.step
-    return place[order[0]] if bool((place >= 0).all()) else None
 
 
 def _fields(layout: ReturnLayout) -> tuple[list[int], list[tuple[int, int, int, bool]]]:

@@ -1,14 +1,19 @@
 /* Columns of a window to points of a scan: every pixel is read once and written to its final row.
 
-   Formulas: `lidar/geometry.py`, `lidar/projections.py`. A column is decoded to planes, one value a beam, which fit into the first cache; an element is
-   `return * width + beam`. Beams beyond those of the lidar have no return. */
+   Formulas: `lidar/geometry.py`, `lidar/projections.py`. A column is decoded to planes, one value a
+   beam, which fit into the first cache; an element is `return * width + beam`. Beams beyond those
+   of the lidar have no return.
+
+   Loops are written once, for vectors of LANES numbers (`decode_wide.c` has more), or without
+   branches, so that compilers make vectors of them. With any number of lanes the operations on a
+   value are the same, and so are the bytes on all processors. */
 #include <math.h>
 #include <string.h>
 
 #include "native.h"
 
-#if defined(__SSE2__)
-#include <emmintrin.h>
+#if defined(MLBATCH_WIDE)
+#include <cpuid.h>
 #endif
 
 #define MOST_ELEMENTS (MOST_BEAMS * MOST_RETURNS)
@@ -18,34 +23,62 @@
 #define SPEED_BIT 32
 #define SPEED_SIGN (INT64_C(1) << 23)
 #define TABLE_BIT 56
-/* The usual case of TABLED, as a kind: the axis of the rotor is vertical, so that vector 3 is zero
-   for x and y, and vectors 1 and 2 are for z; with this many beams, so that vectors are constant
-   distances apart. Bits as in `Group.used`. */
-#define UPRIGHT (-1)
-#define UPRIGHT_BEAMS 128
+/* `Group.used` where the axis of the rotor is vertical: vector 3 is zero for x and y, vectors 1 and
+   2 are for z. As a constant it saves a tenth of the time of a scan. */
 #define UPRIGHT_VECTORS 043
-#define ALL_VECTORS 077
+
+/* x, y, z, level */
+enum { AXES = 3, POINT = 4 };
+
+#ifndef LANES
+#define LANES 4
+#endif
+
+/* Numbers of LANES beams. */
+typedef float Floats __attribute__((vector_size(4 * LANES)));
+typedef int32_t Ints __attribute__((vector_size(4 * LANES)));
+typedef uint32_t Words __attribute__((vector_size(4 * LANES)));
 
 /* Planes of one column. */
 typedef struct {
     _Alignas(64) float range_m[MOST_ELEMENTS];
+    _Alignas(64) float xyz[AXES][MOST_ELEMENTS];
     _Alignas(64) float level[MOST_ELEMENTS];
-    _Alignas(64) float x[MOST_ELEMENTS];
-    _Alignas(64) float y[MOST_ELEMENTS];
-    _Alignas(64) float z[MOST_ELEMENTS];
-    _Alignas(64) int64_t label[MOST_ELEMENTS];
+    _Alignas(64) int32_t keep[MOST_ELEMENTS]; /* bits of ones, or 0 */
     _Alignas(64) uint32_t words[MOST_WORDS][MOST_BEAMS];
     _Alignas(64) uint16_t reflectivity[MOST_ELEMENTS];
-    _Alignas(64) uint8_t keep[MOST_ELEMENTS];
+    _Alignas(64) int64_t label[MOST_ELEMENTS];
+    _Alignas(64) float point[MOST_ELEMENTS][POINT];
 } Planes;
+
+/* Elements of two vectors by their numbers. */
+#if defined(__clang__)
+#define SHUFFLE(kind, a, b, ...) __builtin_shufflevector(a, b, __VA_ARGS__)
+#else
+#define SHUFFLE(kind, a, b, ...) __builtin_shuffle(a, b, (kind){__VA_ARGS__})
+#endif
 
 /* -- pixels ------------------------------------------------------------------------------------ */
 
 /* Words of pixels that are `step` bytes apart. Words of short pixels reach up to 3 bytes beyond
    them; rings have that much room behind their last column. */
-static inline void gather_every(const uint8_t *from, int64_t step, int64_t count, uint32_t *out)
+FOR_CONSTANTS void gather_every(const uint8_t *from, int64_t step, int64_t count, uint32_t *out)
 {
-    for (int64_t pixel = 0; pixel < count; pixel++)
+    int64_t pixel = 0;
+#if LANES == 8
+    /* Four by a shuffle of bytes, which are those of five pixels or of four and the next byte. */
+    typedef uint8_t Bytes __attribute__((vector_size(16)));
+    for (; step == 3 && count >= 8 && pixel + 4 <= count; pixel += 4) {
+        Bytes bytes;
+        const int is_last = pixel + 8 > count;
+        memcpy(&bytes, from + 3 * pixel - (is_last ? 3 : 0), sizeof bytes);
+        bytes = is_last
+            ? SHUFFLE(Bytes, bytes, bytes, 3, 4, 5, 6, 6, 7, 8, 9, 9, 10, 11, 12, 12, 13, 14, 15)
+            : SHUFFLE(Bytes, bytes, bytes, 0, 1, 2, 3, 3, 4, 5, 6, 6, 7, 8, 9, 9, 10, 11, 12);
+        memcpy(out + pixel, &bytes, sizeof bytes);
+    }
+#endif
+    for (; pixel < count; pixel++)
         memcpy(out + pixel, from + pixel * step, 4);
 }
 
@@ -62,49 +95,64 @@ static void gather(const uint8_t *from, int64_t step, int64_t count, uint32_t *o
     }
 }
 
-/* Words of pixels at any places. */
-static void gather_at(const uint8_t *from, const int64_t *places, int64_t count, uint32_t *out)
+static inline Floats load(const float *from)
 {
-    for (int64_t pixel = 0; pixel < count; pixel++)
-        memcpy(out + pixel, from + places[pixel], 4);
+    Floats values;
+    memcpy(&values, from, sizeof values);
+    return values;
 }
 
-/* Swap the two bytes of a big-endian field; other bits of the words stay. */
-static void swap_bytes(uint32_t *words, const Field *field, int64_t width)
+static inline void store(float *to, Floats values)
 {
-    const int shift = (int)field->shift;
-    const uint32_t others = ~(UINT32_C(0xFFFF) << shift);
-    for (int64_t beam = 0; beam < width; beam++) {
-        const uint32_t value = words[beam] >> shift;
-        const uint32_t swapped = (value & 0xFF) << 8 | (value >> 8 & 0xFF);
-        words[beam] = (words[beam] & others) | swapped << shift;
-    }
+    memcpy(to, &values, sizeof values);
 }
 
-static void to_ranges(const uint32_t *restrict words, const Field *field, int32_t silent,
-                      const float *scale, int64_t width, float *restrict range_m)
+static inline Ints load_keep(const int32_t *from)
 {
-    const int shift = (int)field->shift;
-    const uint32_t mask = (uint32_t)field->mask;
-    const float factor = scale[0], divisor = scale[1];
-    for (int64_t beam = 0; beam < width; beam++) {
-        const int32_t value = (int32_t)(words[beam] >> shift & mask);
-        /* A mask instead of a branch, which would not be vectorised; 0 gives exactly 0 m. */
-        range_m[beam] = (float)(value & -(int32_t)(value > silent)) * factor / divisor;
-    }
+    Ints lanes;
+    memcpy(&lanes, from, sizeof lanes);
+    return lanes;
 }
 
-static void to_levels(const uint32_t *restrict words, const Field *field, int64_t width,
-                      float *restrict levels)
+/* Bits of the lanes that are kept. */
+static inline int bits_of(Ints keep)
 {
-    const int shift = (int)field->shift;
-    const uint32_t mask = (uint32_t)field->mask;
-    for (int64_t beam = 0; beam < width; beam++)
-        levels[beam] = (float)(int32_t)(words[beam] >> shift & mask);
+#if LANES == 8
+    return __builtin_ia32_movmskps256((Floats)keep);
+#elif defined(__SSE__)
+    return __builtin_ia32_movmskps((Floats)keep);
+#else
+    const Ints bits = keep & (Ints){1, 2, 4, 8};
+    return bits[0] | bits[1] | bits[2] | bits[3];
+#endif
 }
 
-static void to_reflectivities(const uint32_t *restrict words, const Field *field, int64_t width,
-                              uint16_t *restrict reflectivity)
+static inline Words field_of(const Field *field, Words words)
+{
+    return words >> (uint32_t)field->shift & (uint32_t)field->mask;
+}
+
+/* Words of the pixels of one return, of all channels; distances of 0 for channels without returns
+   and beyond the channels. */
+static void read_words(const Group *group, const uint8_t *record, int64_t which, Planes *planes)
+{
+    const int64_t *run = group->runs + which * group->run_count * 3;
+    const int64_t *bytes = group->word_bytes + which * group->word_count;
+    for (int64_t number = 0; number < group->run_count; number++, run += 3)
+        for (int64_t word = 0; word < group->word_count; word++)
+            gather(record + run[0] + bytes[word], group->step, run[2],
+                   planes->words[word] + run[1]);
+    const Field *distance = group->fields + which * FIELDS + DISTANCE;
+    const uint32_t bits = distance->is_big ? 0xFFFF : (uint32_t)distance->mask;
+    uint32_t *words = planes->words[distance->word];
+    for (int64_t number = 0; number < group->dark_count; number++)
+        words[group->dark[number]] &= ~(bits << (int)distance->shift);
+    for (int64_t beam = group->beams; beam < group->width; beam++)
+        words[beam] = 0;
+}
+
+static void read_reflectivities(const uint32_t *restrict words, const Field *field, int64_t width,
+                                uint16_t *restrict reflectivity)
 {
     const int shift = (int)field->shift;
     const uint32_t mask = (uint32_t)field->mask;
@@ -112,39 +160,40 @@ static void to_reflectivities(const uint32_t *restrict words, const Field *field
         reflectivity[beam] = (uint16_t)(words[beam] >> shift & mask);
 }
 
-/* Words of the pixels of one return, of all channels; distances in little-endian order, 0 for
-   channels without returns. */
-static void read_words(const Group *group, const uint8_t *record, int64_t which, Planes *planes)
+/* Range, level and reflectivity of all returns of a column, and which have a range. */
+static void read_pixels(const Group *group, const uint8_t *record, Planes *planes)
 {
-    const int64_t *run = group->runs + which * group->run_count * 3;
-    const int64_t *bytes = group->word_bytes + which * group->word_count;
-    for (int64_t word = 0; group->places && word < group->word_count; word++)
-        gather_at(record + bytes[word], group->places, group->slots, planes->words[word]);
-    for (int64_t number = 0; !group->places && number < group->run_count; number++, run += 3)
-        for (int64_t word = 0; word < group->word_count; word++)
-            gather(record + run[0] + bytes[word], group->step, run[2],
-                   planes->words[word] + run[1]);
-    const Field *distance = group->fields + which * FIELDS + DISTANCE;
-    uint32_t *words = planes->words[distance->word];
-    if (distance->is_big)
-        swap_bytes(words, distance, group->width);
-    for (int64_t number = 0; number < group->dark_count; number++)
-        words[group->dark[number]] &= ~((uint32_t)distance->mask << (int)distance->shift);
-}
-
-/* Range, level and reflectivity of one return of a column. */
-static void read_return(const Group *group, const uint8_t *record, int64_t which, Planes *planes)
-{
-    const int64_t width = group->width, first = which * width;
-    const Field *fields = group->fields + which * FIELDS;
-    read_words(group, record, which, planes);
-    to_ranges(planes->words[fields[DISTANCE].word], fields + DISTANCE, (int32_t)group->silent,
-              group->scale, width, planes->range_m + first);
-    to_levels(planes->words[fields[INTENSITY].word], fields + INTENSITY, width,
-              planes->level + first);
-    if (group->has_reflectivity)
-        to_reflectivities(planes->words[fields[REFLECTIVITY].word], fields + REFLECTIVITY, width,
-                          planes->reflectivity + first);
+    const int64_t width = group->width;
+    const int32_t silent = (int32_t)group->silent;
+    const float factor = group->scale[0], divisor = group->scale[1];
+    for (int64_t which = 0; which < group->returns; which++) {
+        const Field *fields = group->fields + which * FIELDS;
+        const Field distance = fields[DISTANCE], level = fields[INTENSITY];
+        read_words(group, record, which, planes);
+        for (int64_t beam = 0, element = which * width; beam < width;
+             beam += LANES, element += LANES) {
+            Words words;
+            memcpy(&words, planes->words[distance.word] + beam, sizeof words);
+            words >>= (uint32_t)distance.shift;
+            if (distance.is_big)
+                words = (words & 0xFF) << 8 | (words >> 8 & 0xFF);
+            const Ints value = (Ints)(words & (uint32_t)distance.mask);
+            const Ints keep = value > silent;
+            memcpy(planes->keep + element, &keep, sizeof keep);
+            if (!bits_of(keep)) {
+                store(planes->range_m + element, (Floats){0});
+                continue;
+            }
+            store(planes->range_m + element,
+                  __builtin_convertvector(value & keep, Floats) * factor / divisor);
+            memcpy(&words, planes->words[level.word] + beam, sizeof words);
+            store(planes->level + element,
+                  __builtin_convertvector((Ints)field_of(&level, words), Floats));
+        }
+        if (group->has_reflectivity)
+            read_reflectivities(planes->words[fields[REFLECTIVITY].word], fields + REFLECTIVITY,
+                                width, planes->reflectivity + which * width);
+    }
 }
 
 /* -- points ------------------------------------------------------------------------------------ */
@@ -156,56 +205,6 @@ static int64_t table_row(const Group *group, int64_t member, int64_t encoder)
     return row < 0 ? 0 : row >= group->rows ? group->rows - 1 : row;
 }
 
-/* One coordinate: (r + reach) * (cos * V1 + sin * V2 + V3) + origin. */
-static inline void place(const float *restrict range_m, const float *restrict reach,
-                         const float *restrict vectors, int64_t width, float cosine, float sine,
-                         float origin, float *restrict out)
-{
-    const float *restrict second = vectors + 3 * width;
-    const float *restrict third = vectors + 6 * width;
-    for (int64_t beam = 0; beam < width; beam++) {
-        const float direction = cosine * vectors[beam] + sine * second[beam] + third[beam];
-        out[beam] = (range_m[beam] + reach[beam]) * direction + origin;
-    }
-}
-
-/* Tabled: all beams at the angle of a row of the table. */
-static void project_tabled(const Group *group, int64_t member, int64_t encoder, Planes *planes)
-{
-    const int64_t width = group->width;
-    const int64_t row = table_row(group, member, encoder);
-    const float *restrict vectors = group->direction + member * 9 * width;
-    const float *restrict reach = group->reach + member * width;
-    const float *origin = group->origin + row * 3;
-    const float cosine = group->cosine[row], sine = group->sine[row];
-    for (int64_t which = 0; which < group->returns; which++) {
-        const float *range_m = planes->range_m + which * width;
-        float *planes_of[] = {planes->x, planes->y, planes->z};
-        for (int64_t axis = 0; axis < 3; axis++)
-            place(range_m, reach, vectors + axis * width, width, cosine, sine, origin[axis],
-                  planes_of[axis] + which * width);
-    }
-}
-
-/* cos * V1 + sin * V2 + V3 of one axis; vectors that are zero are left out. */
-static void combine(const float *restrict vectors, int64_t width, int64_t used,
-                    const float *restrict cosine, const float *restrict sine, float *restrict out)
-{
-    const float *restrict first = vectors;
-    const float *restrict second = vectors + 3 * width;
-    const float *restrict third = vectors + 6 * width;
-    const int rotates = used & 1, is_constant = used >> 3 & 1;
-    if (!rotates) {
-        memcpy(out, third, (size_t)width * sizeof *out);
-    } else if (!is_constant) {
-        for (int64_t beam = 0; beam < width; beam++)
-            out[beam] = cosine[beam] * first[beam] + sine[beam] * second[beam];
-    } else {
-        for (int64_t beam = 0; beam < width; beam++)
-            out[beam] = cosine[beam] * first[beam] + sine[beam] * second[beam] + third[beam];
-    }
-}
-
 /* Speed of the rotor in a rotor word, radians in a ns. */
 static float speed_of(int64_t encoder)
 {
@@ -214,89 +213,148 @@ static float speed_of(int64_t encoder)
     return (float)((double)((field ^ SPEED_SIGN) - SPEED_SIGN) * (0x1p-48 * 2 * 3.141592653589793));
 }
 
-/* Square roots of a multiple of four numbers; all compilers round them correctly. */
-static void take_roots(float *values, int64_t count)
+/* What the projection of beams needs besides ranges; vectors as in `Group`. */
+typedef struct {
+    int64_t width;
+    int64_t used;
+    const float *direction; /* (3 vectors, 3 axes, width) */
+    const float *origin;    /* as direction; has_origin: (3,), one for all */
+    const float *reach;     /* or NULL */
+    const float *firing_ns; /* or NULL */
+    float cosine, sine, speed;
+} Beams;
+
+/* cos * V1 + sin * V2 + V3 of one axis, of the vectors in `used`. */
+static inline Floats combine(const float *vectors, int64_t width, int64_t used, Floats cosine,
+                             Floats sine)
 {
-#if defined(__SSE2__)
-    for (int64_t at = 0; at < count; at += 4)
-        _mm_storeu_ps(values + at, _mm_sqrt_ps(_mm_loadu_ps(values + at)));
-#else
-    for (int64_t at = 0; at < count; at++)
-        values[at] = sqrtf(values[at]);
-#endif
+    const Floats third = load(vectors + 6 * width);
+    if (!(used & 1))
+        return third;
+    const Floats turned = cosine * load(vectors) + sine * load(vectors + 3 * width);
+    return used >> 3 & 1 ? turned + third : turned;
 }
 
-/* Points so near that they are projected from the axis. */
-static void place_near(const float *axis_m, const float *range_m,
-                       float (*direction)[MOST_BEAMS], int64_t width, float *x, float *y, float *z)
+/* (r + reach) * direction + origin of the beams from `beam`. */
+FOR_CONSTANTS void place(const Beams *beams, int has_origin, int64_t used, int64_t beam,
+                         Floats range_m, Floats *xyz)
+{
+    const int64_t width = beams->width;
+    Floats cosine = (Floats){0} + beams->cosine, sine = (Floats){0} + beams->sine;
+    if (beams->firing_ns) {
+        const Floats turned = beams->speed * load(beams->firing_ns + beam);
+        const Floats half = turned * 0.5f;
+        const Floats before = cosine, across = sine;
+        cosine = before - (half * before + across) * turned;
+        sine = across + (before - half * across) * turned;
+    }
+    if (beams->reach)
+        range_m += load(beams->reach + beam);
+    for (int axis = 0; axis < AXES; axis++) {
+        const int64_t first = axis * width + beam;
+        const Floats along =
+            combine(beams->direction + first, width, used >> axis, cosine, sine);
+        if (has_origin)
+            xyz[axis] = range_m * along + beams->origin[axis];
+        else
+            xyz[axis] = range_m * along
+                + combine(beams->origin + first, width, used >> (6 + axis), cosine, sine);
+    }
+}
+
+/* Points of all returns; those of beams without any range are undefined. */
+FOR_CONSTANTS void place_all(const Beams *beams, int has_origin, int64_t used, int64_t returns,
+                             const float *ranges_m, Planes *planes)
+{
+    for (int64_t which = 0; which < returns; which++)
+        for (int64_t beam = 0, element = which * beams->width; beam < beams->width;
+             beam += LANES, element += LANES) {
+            Floats xyz[AXES];
+            if (!bits_of(load_keep(planes->keep + element)))
+                continue;
+            place(beams, has_origin, used, beam, load(ranges_m + element), xyz);
+            for (int axis = 0; axis < AXES; axis++)
+                store(planes->xyz[axis] + element, xyz[axis]);
+        }
+}
+
+/* Tabled: all beams at the angle of a row of the table. */
+static void project_tabled(const Group *group, int64_t member, int64_t encoder, Planes *planes)
+{
+    const int64_t width = group->width, row = table_row(group, member, encoder);
+    const Beams beams = {
+        .width = width,
+        .used = group->used[member],
+        .direction = group->direction + member * 9 * width,
+        .origin = group->origin + row * 3,
+        .reach = group->reach + member * width,
+        .cosine = group->cosine[row],
+        .sine = group->sine[row],
+    };
+    if (beams.used == UPRIGHT_VECTORS)
+        place_all(&beams, 1, UPRIGHT_VECTORS, group->returns, planes->range_m, planes);
+    else
+        place_all(&beams, 1, beams.used, group->returns, planes->range_m, planes);
+}
+
+/* Ranges from the point where beams pass the axis, of ranges from the axis. */
+static void to_axis(const float *restrict range_m, const float *restrict miss_m2, int64_t width,
+                    float *restrict out)
+{
+    for (int64_t beam = 0; beam < width; beam++) {
+        const float behind_m2 = range_m[beam] * range_m[beam] - miss_m2[beam];
+        out[beam] = sqrtf(behind_m2 > 0.0f ? behind_m2 : 0.0f);
+    }
+}
+
+/* Points so near that they are projected from the axis, `beams->origin`. */
+static void place_near(const Beams *beams, int64_t first, Planes *planes)
 {
     const float nearest_m = 0.09f;
-    for (int64_t beam = 0; beam < width; beam++)
-        if (range_m[beam] > 0.0f && range_m[beam] <= nearest_m) {
-            x[beam] = range_m[beam] * direction[0][beam] + axis_m[0];
-            y[beam] = range_m[beam] * direction[1][beam] + axis_m[1];
-            z[beam] = range_m[beam] * direction[2][beam] + axis_m[2];
-        }
+    for (int64_t beam = 0; beam < beams->width; beam += LANES) {
+        const Floats range_m = load(planes->range_m + first + beam);
+        const Ints is_near = (range_m > 0.0f) & (range_m <= nearest_m);
+        if (!bits_of(is_near))
+            continue;
+        Floats xyz[AXES];
+        place(beams, 1, beams->used, beam, range_m, xyz);
+        for (int axis = 0; axis < AXES; axis++)
+            for (int lane = 0; lane < LANES; lane++)
+                if (is_near[lane])
+                    planes->xyz[axis][first + beam + lane] = xyz[axis][lane];
+    }
 }
 
 /* Turning: each beam fires at its own angle of the rotor. */
 static void project_turning(const Group *group, int64_t member, int64_t encoder, int64_t table,
                             int64_t column, Planes *planes)
 {
-    _Alignas(64) float cosine[MOST_BEAMS], sine[MOST_BEAMS];
-    _Alignas(64) float direction[3][MOST_BEAMS], origin[3][MOST_BEAMS];
     const int64_t width = group->width;
     const float speed = speed_of(encoder);
-    for (int64_t beam = 0; beam < width; beam++) {
-        cosine[beam] = group->cosine[column];
-        sine[beam] = group->sine[column];
+    Beams beams = {
+        .width = width,
+        .used = group->used[member],
+        .direction = group->direction + member * 9 * width,
+        .origin = group->origin + member * 9 * width,
+        .reach = group->reach ? group->reach + member * width : 0,
+        .firing_ns = group->firing_ns && speed != 0.0f ? group->firing_ns + table * width : 0,
+        .cosine = group->cosine[column],
+        .sine = group->sine[column],
+        .speed = speed,
+    };
+    if (!group->miss_m2) {
+        place_all(&beams, 0, beams.used, group->returns, planes->range_m, planes);
+        return;
     }
-    if (group->firing_ns && speed != 0.0f) {
-        const float *restrict firing_ns = group->firing_ns + table * width;
-        for (int64_t beam = 0; beam < width; beam++) {
-            const float before = cosine[beam], across = sine[beam];
-            const float turned = speed * firing_ns[beam];
-            const float half = turned * 0.5f;
-            cosine[beam] = before - (half * before + across) * turned;
-            sine[beam] = across + (before - half * across) * turned;
-        }
-    }
-    const float *directions = group->direction + member * 9 * width;
-    const float *origins = group->origin + member * 9 * width;
-    const int64_t used = group->used[member];
-    for (int64_t axis = 0; axis < 3; axis++) {
-        combine(directions + axis * width, width, used >> axis, cosine, sine, direction[axis]);
-        combine(origins + axis * width, width, used >> (6 + axis), cosine, sine, origin[axis]);
-    }
-    for (int64_t which = 0; which < group->returns; which++) {
-        const float *restrict range_m = planes->range_m + which * width;
-        if (group->miss_m2) {
-            const float *restrict miss_m2 = group->miss_m2 + member * width;
-            for (int64_t beam = 0; beam < width; beam++) {
-                const float behind_m2 = range_m[beam] * range_m[beam] - miss_m2[beam];
-                sine[beam] = behind_m2 > 0.0f ? behind_m2 : 0.0f;
-            }
-            take_roots(sine, width);
-            range_m = sine;
-        }
-        if (group->reach) {
-            const float *restrict reach = group->reach + member * width;
-            for (int64_t beam = 0; beam < width; beam++)
-                cosine[beam] = range_m[beam] + reach[beam];
-            range_m = cosine;
-        }
-        float *restrict x = planes->x + which * width;
-        float *restrict y = planes->y + which * width;
-        float *restrict z = planes->z + which * width;
-        for (int64_t beam = 0; beam < width; beam++) {
-            x[beam] = range_m[beam] * direction[0][beam] + origin[0][beam];
-            y[beam] = range_m[beam] * direction[1][beam] + origin[1][beam];
-            z[beam] = range_m[beam] * direction[2][beam] + origin[2][beam];
-        }
-        if (group->miss_m2)
-            place_near(group->axis_m + 3 * member, planes->range_m + which * width, direction,
-                       width, x, y, z);
-    }
+    _Alignas(64) float ranges_m[MOST_ELEMENTS];
+    for (int64_t which = 0; which < group->returns; which++)
+        to_axis(planes->range_m + which * width, group->miss_m2 + member * width, width,
+                ranges_m + which * width);
+    place_all(&beams, 0, beams.used, group->returns, ranges_m, planes);
+    beams.reach = 0;
+    beams.origin = group->axis_m + 3 * member;
+    for (int64_t which = 0; which < group->returns; which++)
+        place_near(&beams, which * width, planes);
 }
 
 /* Corrected: the correction of a range depends on the position of the point (docs/sources/
@@ -338,15 +396,17 @@ static void project_corrected(const Group *group, int64_t encoder, int64_t table
             const float right = right_m * flat * aside - own[ASIDE_M * width] * ahead;
             const float forward = forward_m * flat * ahead + own[ASIDE_M * width] * aside;
             const float up = up_m * own[UP * width] + own[ABOVE_M * width];
-            planes->x[element] = pose[0] * forward - pose[1] * right + pose[2] * up + pose[3];
-            planes->y[element] = pose[4] * forward - pose[5] * right + pose[6] * up + pose[7];
-            planes->z[element] = pose[8] * forward - pose[9] * right + pose[10] * up + pose[11];
+            for (int axis = 0; axis < AXES; axis++) {
+                const float *row = pose + POINT * axis;
+                planes->xyz[axis][element] =
+                    row[0] * forward - row[1] * right + row[2] * up + row[3];
+            }
         }
     }
 }
 
 /* Rotate a direction by a small angle, below 0.05 rad: the next terms are d**5 / 120. */
-static inline void rotate(float *cosine, float *sine, float more)
+static void rotate(float *cosine, float *sine, float more)
 {
     const float square = more * more;
     const float by_sine = (square * (float)(-1.0 / 6) + 1.0f) * more;
@@ -391,7 +451,7 @@ static void project_mirrored(const Group *group, int64_t encoder, int64_t table,
         rotate(&flat, &up, group->elevation_slope[cell] * part + group->elevation_value[cell]);
         const float right = flat * sine, forward = flat * cosine;
         for (int64_t axis = 0; axis < 3; axis++) {
-            float *out = axis == 0 ? planes->x : axis == 1 ? planes->y : planes->z;
+            float *out = planes->xyz[axis];
             const float *row = pose + 4 * axis;
             const float towards = right * row[0] + row[1] * forward + row[2] * up;
             for (int64_t which = 0; which < group->returns; which++) {
@@ -402,7 +462,7 @@ static void project_mirrored(const Group *group, int64_t encoder, int64_t table,
     }
 }
 
-static inline double sine_of(const Group *group, int64_t angle_cdeg)
+static double sine_of(const Group *group, int64_t angle_cdeg)
 {
     return (double)group->sines[angle_cdeg % 36000];
 }
@@ -412,7 +472,7 @@ static void read_coordinates(const Group *group, int64_t member, const uint8_t *
                              Planes *planes)
 {
     const double *pose = group->pose_f8 + 12 * member;
-    memset(planes->range_m, 0, (size_t)(group->returns * group->width) * sizeof(float));
+    memset(planes->keep, 0, (size_t)(group->returns * group->width) * sizeof *planes->keep);
     for (int64_t which = 0; which < group->returns; which++, record += group->step) {
         const int64_t element = which * group->width;
         double x, y, z, range_m;
@@ -439,814 +499,367 @@ static void read_coordinates(const Group *group, int64_t member, const uint8_t *
             range_m = sqrt(x * x + y * y + z * z);
         }
         planes->range_m[element] = (float)range_m;
+        planes->keep[element] = -(int32_t)(planes->range_m[element] > 0.0f);
         planes->level[element] = (float)record[group->runs[0]];
-        planes->x[element] = (float)(x * pose[0] + y * pose[1] + z * pose[2] + pose[3]);
-        planes->y[element] = (float)(x * pose[4] + y * pose[5] + z * pose[6] + pose[7]);
-        planes->z[element] = (float)(x * pose[8] + y * pose[9] + z * pose[10] + pose[11]);
+        planes->xyz[0][element] = (float)(x * pose[0] + y * pose[1] + z * pose[2] + pose[3]);
+        planes->xyz[1][element] = (float)(x * pose[4] + y * pose[5] + z * pose[6] + pose[7]);
+        planes->xyz[2][element] = (float)(x * pose[8] + y * pose[9] + z * pose[10] + pose[11]);
+    }
+}
+
+/* Rotate and shift points; turn, shift_m: first of the three rows, which are that far apart. */
+static void move(const float *turn, int64_t turn_step, const float *shift_m, int64_t shift_step,
+                 int64_t elements, Planes *planes)
+{
+    float *restrict x = planes->xyz[0];
+    float *restrict y = planes->xyz[1];
+    float *restrict z = planes->xyz[2];
+    const float *second = turn + turn_step, *third = turn + 2 * turn_step;
+    const float rows[AXES][POINT] = {
+        {turn[0], turn[1], turn[2], shift_m[0]},
+        {second[0], second[1], second[2], shift_m[shift_step]},
+        {third[0], third[1], third[2], shift_m[2 * shift_step]},
+    };
+    for (int64_t element = 0; element < elements; element++) {
+        const float x_m = x[element], y_m = y[element], z_m = z[element];
+        x[element] = x_m * rows[0][0] + y_m * rows[0][1] + z_m * rows[0][2] + rows[0][3];
+        y[element] = x_m * rows[1][0] + y_m * rows[1][1] + z_m * rows[1][2] + rows[1][3];
+        z[element] = x_m * rows[2][0] + y_m * rows[2][1] + z_m * rows[2][2] + rows[2][3];
     }
 }
 
 /* Placed: points that a driver computed, rotated and shifted. */
 static void read_placed(const Group *group, int64_t member, const uint8_t *record, Planes *planes)
 {
-    const int64_t beams = group->beams;
+    const size_t bytes = (size_t)group->beams * sizeof(float);
     const uint8_t *from = record + group->runs[0];
-    float *restrict x = planes->x;
-    float *restrict y = planes->y;
-    float *restrict z = planes->z;
+    float *restrict x = planes->xyz[0];
+    float *restrict y = planes->xyz[1];
+    float *restrict z = planes->xyz[2];
     float *restrict range_m = planes->range_m;
-    memcpy(x, from, (size_t)beams * 4);
-    memcpy(y, from + 4 * beams, (size_t)beams * 4);
-    memcpy(z, from + 8 * beams, (size_t)beams * 4);
-    memcpy(planes->level, from + 12 * beams, (size_t)beams * 4);
-    for (int64_t beam = beams; beam < group->width; beam++)
-        x[beam] = y[beam] = z[beam] = 0;
-    for (int64_t beam = 0; beam < group->width; beam++)
-        range_m[beam] = x[beam] * x[beam] + y[beam] * y[beam] + z[beam] * z[beam];
-    take_roots(range_m, group->width);
-    const float *turn = group->direction + 9 * member, *shift_m = group->origin + 3 * member;
-    for (int64_t beam = 0; beam < group->width; beam++) {
-        const float before[] = {x[beam], y[beam], z[beam]};
-        x[beam] = before[0] * turn[0] + before[1] * turn[1] + before[2] * turn[2] + shift_m[0];
-        y[beam] = before[0] * turn[3] + before[1] * turn[4] + before[2] * turn[5] + shift_m[1];
-        z[beam] = before[0] * turn[6] + before[1] * turn[7] + before[2] * turn[8] + shift_m[2];
+    for (int axis = 0; axis < AXES; axis++) {
+        memcpy(planes->xyz[axis], from + (size_t)axis * bytes, bytes);
+        for (int64_t beam = group->beams; beam < group->width; beam++)
+            planes->xyz[axis][beam] = 0;
     }
+    memcpy(planes->level, from + AXES * bytes, bytes);
+    int32_t *restrict keep = planes->keep;
+    for (int64_t beam = 0; beam < group->width; beam++) {
+        range_m[beam] = sqrtf(x[beam] * x[beam] + y[beam] * y[beam] + z[beam] * z[beam]);
+        keep[beam] = -(int32_t)(range_m[beam] > 0.0f);
+    }
+    move(group->direction + 9 * member, 3, group->origin + 3 * member, 1, group->width, planes);
 }
 
 /* -- which slots become points ----------------------------------------------------------------- */
 
-static int64_t count_kept(const uint8_t *keep, int64_t elements)
+static int64_t count_kept(const int32_t *restrict keep, int64_t elements)
 {
-    int64_t total = 0;
+    int32_t total = 0;
     for (int64_t element = 0; element < elements; element++)
-        total += keep[element];
+        total -= keep[element];
     return total;
 }
 
-/* Mark the elements to keep; count those left after each step. */
+/* Leave out returns that are the same as an earlier one of their shot. */
+static void drop_repeated(const Group *group, Planes *planes)
+{
+    const int64_t width = group->width;
+    for (int64_t which = 1; which < group->returns; which++)
+        for (int64_t earlier = 0; earlier < which; earlier++) {
+            const float *restrict later_m = planes->range_m + which * width;
+            const float *restrict earlier_m = planes->range_m + earlier * width;
+            int32_t *restrict keep = planes->keep + which * width;
+            for (int64_t beam = 0; beam < width; beam++)
+                keep[beam] &= -(int32_t)(later_m[beam] != earlier_m[beam]);
+        }
+}
+
+static void drop_inside(const float *box, int64_t elements, Planes *planes)
+{
+    const float *restrict x = planes->xyz[0];
+    const float *restrict y = planes->xyz[1];
+    const float *restrict z = planes->xyz[2];
+    int32_t *restrict keep = planes->keep;
+    for (int64_t element = 0; element < elements; element++) {
+        const int32_t inside = (x[element] >= box[0]) & (x[element] <= box[3])
+            & (y[element] >= box[1]) & (y[element] <= box[4])
+            & (z[element] >= box[2]) & (z[element] <= box[5]);
+        keep[element] &= inside - 1;
+    }
+}
+
+static int has_filters(const Scan *scan, const Group *group)
+{
+    return group->drops_repeated || group->limits_m || scan->box_count;
+}
+
+/* Drop elements by all filters; count those left after each. */
 static void mark(const Scan *scan, const Group *group, int64_t member, Planes *planes)
 {
-    const int64_t width = group->width, elements = group->returns * width;
+    const int64_t elements = group->returns * group->width;
     const float *restrict range_m = planes->range_m;
-    uint8_t *restrict keep = planes->keep;
+    int32_t *restrict keep = planes->keep;
     int64_t *counts = group->counts + member * COUNTS;
-    for (int64_t element = 0; element < elements; element++)
-        keep[element] = range_m[element] > 0.0f;
     int64_t left = count_kept(keep, elements);
     counts[FOUND] += left;
     if (group->drops_repeated) {
-        for (int64_t which = 1; which < group->returns; which++)
-            for (int64_t earlier = 0; earlier < which; earlier++)
-                for (int64_t beam = 0; beam < width; beam++)
-                    keep[which * width + beam] &=
-                        range_m[which * width + beam] != range_m[earlier * width + beam];
+        drop_repeated(group, planes);
         left = count_kept(keep, elements);
     }
     counts[DISTINCT] += left;
     if (group->limits_m) {
         const float low = group->limits_m[2 * member], high = group->limits_m[2 * member + 1];
         for (int64_t element = 0; element < elements; element++)
-            keep[element] &= (range_m[element] >= low) & (range_m[element] <= high);
+            keep[element] &= -(int32_t)((range_m[element] >= low) & (range_m[element] <= high));
         left = count_kept(keep, elements);
     }
     counts[IN_RANGE] += left;
-    for (int64_t number = 0; number < scan->box_count; number++) {
-        const float *box = scan->boxes_m + 6 * number;
-        const float *restrict x = planes->x;
-        const float *restrict y = planes->y;
-        const float *restrict z = planes->z;
-        for (int64_t element = 0; element < elements; element++) {
-            const int inside = (x[element] >= box[0]) & (x[element] <= box[3])
-                & (y[element] >= box[1]) & (y[element] <= box[4])
-                & (z[element] >= box[2]) & (z[element] <= box[5]);
-            keep[element] &= (uint8_t)!inside;
-        }
-    }
+    for (int64_t number = 0; number < scan->box_count; number++)
+        drop_inside(scan->boxes_m + 6 * number, elements, planes);
     if (scan->box_count)
         left = count_kept(keep, elements);
     counts[OUTSIDE_BOXES] += left;
 }
 
-/* Move the points of a column by a transform (3, 4). */
-static void move_planes(const float *restrict moves, int64_t elements, Planes *planes)
-{
-    float *restrict x = planes->x;
-    float *restrict y = planes->y;
-    float *restrict z = planes->z;
-    for (int64_t element = 0; element < elements; element++) {
-        const float x_m = x[element], y_m = y[element], z_m = z[element];
-        x[element] = x_m * moves[0] + y_m * moves[1] + z_m * moves[2] + moves[3];
-        y[element] = x_m * moves[4] + y_m * moves[5] + z_m * moves[6] + moves[7];
-        z[element] = x_m * moves[8] + y_m * moves[9] + z_m * moves[10] + moves[11];
-    }
-}
-
-/* Labels of all elements; types of dual returns: docs/sources/outputs.md section 3. */
-static void label(const Group *group, int64_t row, int64_t offset_ns, Planes *planes)
+/* Labels of all elements at time 0; types of dual returns: docs/sources/outputs.md section 3. */
+static const int64_t *labels_of(const Group *group, int64_t known, Planes *planes)
 {
     enum { FIRST_STRONG = 3, SINGLE = 7, SUM_OF_TYPES = 9 };
-    const int64_t width = group->width, elements = group->returns * width;
-    const int64_t *restrict words = group->labels + row * elements;
-    int64_t *restrict labels = planes->label;
-    for (int64_t element = 0; element < elements; element++)
-        labels[element] = words[element] + offset_ns;
+    const int64_t width = group->width;
+    const int64_t *words = group->labels + known * group->returns * width;
     if (group->typed == NOT_TYPED)
-        return;
+        return words;
+    const int by_level = group->typed == TYPED_BY_LEVEL;
+    const float *restrict range_m = planes->range_m;
+    const float *restrict level = planes->level;
+    int64_t *restrict labels = planes->label;
     for (int64_t beam = 0; beam < width; beam++) {
-        const float first_m = planes->range_m[beam], second_m = planes->range_m[width + beam];
-        int64_t kind = FIRST_STRONG + (first_m > second_m);
-        if (group->typed == TYPED_BY_LEVEL)
-            kind += 2 * (planes->level[beam] < planes->level[width + beam]);
-        int is_single = (first_m == 0.0f) | (second_m == 0.0f);
-        if (group->sends_twice)
-            is_single |= first_m == second_m;
-        const int64_t single = is_single ? SINGLE : 0;
-        labels[beam] |= (kind | single) << TYPE_BIT;
-        labels[width + beam] |= ((SUM_OF_TYPES - kind) | single) << TYPE_BIT;
+        const float first_m = range_m[beam], second_m = range_m[width + beam];
+        const int32_t kind = FIRST_STRONG + (first_m > second_m)
+            + 2 * (by_level & (level[beam] < level[width + beam]));
+        const int32_t is_single = (first_m == 0.0f) | (second_m == 0.0f)
+            | ((group->sends_twice != 0) & (first_m == second_m));
+        const int32_t single = is_single ? SINGLE : 0;
+        labels[beam] = words[beam] | (int64_t)(kind | single) << TYPE_BIT;
+        labels[width + beam] = words[width + beam]
+            | (int64_t)((SUM_OF_TYPES - kind) | single) << TYPE_BIT;
     }
+    return labels;
 }
 
 /* -- rows -------------------------------------------------------------------------------------- */
 
-static inline void put_point(float *point, const Planes *planes, int64_t element)
-{
-    point[0] = planes->x[element];
-    point[1] = planes->y[element];
-    point[2] = planes->z[element];
-    point[3] = planes->level[element];
-}
+/* A point: x, y, z, level. */
+typedef float Point __attribute__((vector_size(16)));
 
-/* An organized row: arrays from its first slot; range_m and reflectivity may be NULL. */
-typedef struct {
-    float *point;
-    int64_t *labels;
-    float *range_m;
-    uint16_t *reflectivity;
-} Row;
-
-/* Its number in the arrays of the scan. */
-static int64_t organized_row(const Scan *scan, int64_t column)
-{
-    return scan->records ? column % scan->near_columns : scan->first_number + column;
-}
-
-static Row row_at(const Scan *scan, int64_t slot)
-{
-    return (Row){scan->point + 4 * slot, scan->label + slot,
-                 scan->range_m ? scan->range_m + slot : 0,
-                 scan->reflectivity ? scan->reflectivity + slot : 0};
-}
-
-/* Label of slots without a point, by that of any point of the column. */
-static int64_t label_of_empty(int64_t label)
-{
-    return (int64_t)((uint64_t)label >> LIDAR_ID_BIT << LIDAR_ID_BIT);
-}
+/* Numbers from the first, or the second half of each four of two vectors by turns; by pairs. */
+#if LANES == 8
+#define FIRST(a, b) SHUFFLE(Ints, a, b, 0, 8, 1, 9, 4, 12, 5, 13)
+#define SECOND(a, b) SHUFFLE(Ints, a, b, 2, 10, 3, 11, 6, 14, 7, 15)
+#define FIRST_PAIRS(a, b) SHUFFLE(Ints, a, b, 0, 1, 8, 9, 4, 5, 12, 13)
+#define SECOND_PAIRS(a, b) SHUFFLE(Ints, a, b, 2, 3, 10, 11, 6, 7, 14, 15)
+#else
+#define FIRST(a, b) SHUFFLE(Ints, a, b, 0, 4, 1, 5)
+#define SECOND(a, b) SHUFFLE(Ints, a, b, 2, 6, 3, 7)
+#define FIRST_PAIRS(a, b) SHUFFLE(Ints, a, b, 0, 1, 4, 5)
+#define SECOND_PAIRS(a, b) SHUFFLE(Ints, a, b, 2, 3, 6, 7)
+#endif
 
 enum { NAN_BITS = 0x7FC00000 };
 
-/* Slots from `first` to `end` without a point; label: of empty slots. */
-static void empty_slots(const Row *row, int64_t first, int64_t end, int64_t label)
+/* Elements of a plane; blanks: NaN for those that are not kept. */
+static inline Floats load_kept(const float *plane, Ints keep, int blanks)
 {
-    const uint32_t nan_bits = NAN_BITS;
-    float nan;
-    memcpy(&nan, &nan_bits, sizeof nan);
-    for (int64_t value = 4 * first; value < 4 * end; value++)
-        row->point[value] = nan;
-    for (int64_t slot = first; slot < end; slot++)
-        row->labels[slot] = label;
-    for (int64_t slot = first; row->range_m && slot < end; slot++)
-        row->range_m[slot] = nan;
-    for (int64_t slot = first; row->reflectivity && slot < end; slot++)
-        row->reflectivity[slot] = 0;
+    const Floats values = load(plane);
+    return blanks ? (Floats)(((Ints)values & keep) | (NAN_BITS & ~keep)) : values;
 }
 
-#if defined(__SSE2__)
+/* Points of LANES elements: of 4 * k + n in part k of vector n. */
+static inline void transpose(const Planes *planes, int64_t element, int blanks, Floats *points)
+{
+    const Ints keep = load_keep(planes->keep + element);
+    const Floats x = load_kept(planes->xyz[0] + element, keep, blanks);
+    const Floats y = load_kept(planes->xyz[1] + element, keep, blanks);
+    const Floats z = load_kept(planes->xyz[2] + element, keep, blanks);
+    const Floats level = load_kept(planes->level + element, keep, blanks);
+    const Floats low = FIRST(x, y), high = SECOND(x, y);
+    const Floats low_rest = FIRST(z, level), high_rest = SECOND(z, level);
+    points[0] = FIRST_PAIRS(low, low_rest);
+    points[1] = SECOND_PAIRS(low, low_rest);
+    points[2] = FIRST_PAIRS(high, high_rest);
+    points[3] = SECOND_PAIRS(high, high_rest);
+}
+
 /* Rows of lanes 1, 2, 3 after that of lane 0, by the bits of the lanes that are kept, and how many
-   are. */
+   are; all times two, so that processors can address a row of 16 or 8 bytes by it. */
 static const uint8_t NEXT[16][4] = {
-    {0, 0, 0, 0}, {1, 1, 1, 1}, {0, 1, 1, 1}, {1, 2, 2, 2}, {0, 0, 1, 1}, {1, 1, 2, 2},
-    {0, 1, 2, 2}, {1, 2, 3, 3}, {0, 0, 0, 1}, {1, 1, 1, 2}, {0, 1, 1, 2}, {1, 2, 2, 3},
-    {0, 0, 1, 2}, {1, 1, 2, 3}, {0, 1, 2, 3}, {1, 2, 3, 4},
+    {0, 0, 0, 0}, {2, 2, 2, 2}, {0, 2, 2, 2}, {2, 4, 4, 4}, {0, 0, 2, 2}, {2, 2, 4, 4},
+    {0, 2, 4, 4}, {2, 4, 6, 6}, {0, 0, 0, 2}, {2, 2, 2, 4}, {0, 2, 2, 4}, {2, 4, 4, 6},
+    {0, 0, 2, 4}, {2, 2, 4, 6}, {0, 2, 4, 6}, {2, 4, 6, 8},
 };
 
-/* Store the points and labels of the lanes in `kept` to rows from `row`; others are overwritten by
-   the next point. No branch depends on `kept`, which processors would often predict wrongly. p0 to
-   p3: x, y, z, level of four beams. Return the next row. */
-static inline int64_t store_kept(float *point, int64_t *labels, int64_t row, int kept, __m128 p0,
-                                 __m128 p1, __m128 p2, __m128 p3, __m128i low, __m128i high)
+/* Store kept elements in the order of their numbers; a point that is not kept is overwritten by the
+   next one. No branch depends on what is kept but for lanes without any, since processors would
+   often predict it wrongly. Return the next row. */
+static int64_t emit_natural(const Scan *scan, int64_t elements, const int64_t *words,
+                            int64_t offset_ns, int64_t row, const Planes *planes)
 {
-    point += 4 * row;
-    labels += row;
-    _MM_TRANSPOSE4_PS(p0, p1, p2, p3);
-    const uint8_t *next = NEXT[kept];
-    const int64_t second = next[0], third = next[1], fourth = next[2];
-    _mm_storeu_ps(point, p0);
-    _mm_storeu_ps(point + 4 * second, p1);
-    _mm_storeu_ps(point + 4 * third, p2);
-    _mm_storeu_ps(point + 4 * fourth, p3);
-    _mm_storel_epi64((__m128i *)labels, low);
-    _mm_storeh_pi((__m64 *)(labels + second), _mm_castsi128_ps(low));
-    _mm_storel_epi64((__m128i *)(labels + third), high);
-    _mm_storeh_pi((__m64 *)(labels + fourth), _mm_castsi128_ps(high));
-    return row + next[3];
-}
-
-/* 32 bits of ones for each lane in `kept`. */
-static inline __m128i mask_of(int kept)
-{
-    const __m128i bits = _mm_set_epi32(8, 4, 2, 1);
-    return _mm_cmpeq_epi32(_mm_and_si128(_mm_set1_epi32(kept), bits), bits);
-}
-
-/* The lanes of `mask`; others are NaN. */
-static inline __m128 or_nan(__m128i mask, __m128 values)
-{
-    return _mm_castsi128_ps(_mm_or_si128(_mm_and_si128(mask, _mm_castps_si128(values)),
-                                         _mm_andnot_si128(mask, _mm_set1_epi32(NAN_BITS))));
-}
-
-/* Store four beams to the slots from `slot`, as `store_kept`; those not in `mask` are empty. */
-static inline void store_slots(float *point, int64_t *labels, int64_t slot, __m128i mask, __m128 p0,
-                               __m128 p1, __m128 p2, __m128 p3, __m128i low, __m128i high,
-                               __m128i empty)
-{
-    const __m128i first = _mm_unpacklo_epi32(mask, mask), last = _mm_unpackhi_epi32(mask, mask);
-    p0 = or_nan(mask, p0);
-    p1 = or_nan(mask, p1);
-    p2 = or_nan(mask, p2);
-    p3 = or_nan(mask, p3);
-    _MM_TRANSPOSE4_PS(p0, p1, p2, p3);
-    point += 4 * slot;
-    _mm_storeu_ps(point, p0);
-    _mm_storeu_ps(point + 4, p1);
-    _mm_storeu_ps(point + 8, p2);
-    _mm_storeu_ps(point + 12, p3);
-    __m128i *words = (__m128i *)(labels + slot);
-    _mm_storeu_si128(words, _mm_or_si128(_mm_and_si128(first, low), _mm_andnot_si128(first, empty)));
-    _mm_storeu_si128(words + 1,
-                     _mm_or_si128(_mm_and_si128(last, high), _mm_andnot_si128(last, empty)));
-}
-#endif
-
-/* -- the usual case in one pass ----------------------------------------------------------------- */
-
-#if defined(__SSE2__)
-/* What the beams of a column have in common. Beams are done by fours, from pixels to rows. */
-typedef struct {
-    __m128i mask, level_mask, reflectivity_mask, silent, offsets;
-    __m128i empty; /* label of empty slots */
-    __m128i shift, level_shift, reflectivity_shift;
-    __m128 factor, divisor, cosine, sine, speed;
-    __m128 low_m, high_m;
-    __m128 origin[3]; /* TABLED */
-    __m128 moves[12];
-    const float *direction, *origins, *reach, *firing_ns;
-    const int64_t *words;
-    /* Rows, of an organized scan those of the column. */
-    float *point;
-    int64_t *label;
-    float *ranges_m;
-    uint16_t *reflectivities;
-    int64_t used, width, distance_byte, level_byte, reflectivity_byte;
-    int level_word, is_big, is_filtered, is_limited, has_boxes, has_extras, has_moves, is_plain;
-    int is_upright; /* TABLED: `UPRIGHT` fits */
-} Column;
-
-static inline __m128i load_four(const uint8_t *from, int64_t step)
-{
-    if (step == 4)
-        return _mm_loadu_si128((const __m128i *)from);
-    int32_t words[4];
-    for (int lane = 0; lane < 4; lane++)
-        memcpy(words + lane, from + lane * step, 4);
-    return _mm_set_epi32(words[3], words[2], words[1], words[0]);
-}
-
-static inline __m128 multiply_add(__m128 a, __m128 b, __m128 c, __m128 d)
-{
-    return _mm_add_ps(_mm_mul_ps(a, b), _mm_mul_ps(c, d));
-}
-
-/* cos * V1 + sin * V2 + V3 of one axis, as `combine`. */
-static inline __m128 combine_four(const float *vectors, int64_t width, int64_t used, __m128 cosine,
-                                  __m128 sine)
-{
-    const __m128 third = _mm_loadu_ps(vectors + 6 * width);
-    if (!(used & 1))
-        return third;
-    const __m128 turned = multiply_add(cosine, _mm_loadu_ps(vectors), sine,
-                                       _mm_loadu_ps(vectors + 3 * width));
-    return used >> 3 & 1 ? _mm_add_ps(turned, third) : turned;
-}
-
-/* used: bits of the vectors to add, as `Group.used`; a constant here. */
-static inline void place_tabled(const Column *own, int64_t width, int64_t used, int64_t beam,
-                                __m128 range_m, __m128 *xyz)
-{
-    const __m128 reached_m = _mm_add_ps(range_m, _mm_loadu_ps(own->reach + beam));
-    for (int axis = 0; axis < 3; axis++) {
-        const __m128 direction = combine_four(own->direction + axis * width + beam, width,
-                                              used >> axis, own->cosine, own->sine);
-        xyz[axis] = _mm_add_ps(_mm_mul_ps(reached_m, direction), own->origin[axis]);
-    }
-}
-
-static inline void place_turning(const Column *own, int64_t width, int64_t beam, __m128 range_m,
-                                 __m128 *xyz)
-{
-    __m128 cosine = own->cosine, sine = own->sine;
-    if (own->firing_ns) {
-        const __m128 turned = _mm_mul_ps(own->speed, _mm_loadu_ps(own->firing_ns + beam));
-        const __m128 half = _mm_mul_ps(turned, _mm_set1_ps(0.5f));
-        const __m128 before = cosine, across = sine;
-        cosine = _mm_sub_ps(
-            before, _mm_mul_ps(_mm_add_ps(_mm_mul_ps(half, before), across), turned));
-        sine = _mm_add_ps(
-            across, _mm_mul_ps(_mm_sub_ps(before, _mm_mul_ps(half, across)), turned));
-    }
-    if (own->reach)
-        range_m = _mm_add_ps(range_m, _mm_loadu_ps(own->reach + beam));
-    for (int axis = 0; axis < 3; axis++) {
-        const float *directions = own->direction + axis * width + beam;
-        const float *origins = own->origins + axis * width + beam;
-        const __m128 direction =
-            combine_four(directions, width, own->used >> axis, cosine, sine);
-        const __m128 origin =
-            combine_four(origins, width, own->used >> (6 + axis), cosine, sine);
-        xyz[axis] = _mm_add_ps(_mm_mul_ps(range_m, direction), origin);
-    }
-}
-
-/* Lanes of points outside of all boxes. */
-static inline int outside_boxes(const Scan *scan, const __m128 *xyz)
-{
-    __m128 inside = _mm_setzero_ps();
-    for (int64_t number = 0; number < scan->box_count; number++) {
-        const float *box = scan->boxes_m + 6 * number;
-        __m128 both = _mm_cmpeq_ps(_mm_setzero_ps(), _mm_setzero_ps());
-        for (int axis = 0; axis < 3; axis++) {
-            both = _mm_and_ps(both, _mm_cmpge_ps(xyz[axis], _mm_set1_ps(box[axis])));
-            both = _mm_and_ps(both, _mm_cmple_ps(xyz[axis], _mm_set1_ps(box[axis + 3])));
-        }
-        inside = _mm_or_ps(inside, both);
-    }
-    return ~_mm_movemask_ps(inside) & 15;
-}
-
-/* As `move_planes`. */
-static inline void move_four(const __m128 *moves, __m128 *xyz)
-{
-    const __m128 x = xyz[0], y = xyz[1], z = xyz[2];
-    for (int axis = 0; axis < 3; axis++, moves += 4)
-        xyz[axis] = _mm_add_ps(
-            _mm_add_ps(multiply_add(x, moves[0], y, moves[1]), _mm_mul_ps(z, moves[2])), moves[3]);
-}
-
-/* Ranges and reflectivities of the lanes in `kept` to rows from `row`. */
-static inline void store_extras(const Column *own, int64_t row, int kept, __m128 range_m,
-                                __m128i reflectivity)
-{
-    float ranges_m[4];
-    int32_t reflectivities[4];
-    _mm_storeu_ps(ranges_m, range_m);
-    _mm_storeu_si128((__m128i *)reflectivities, reflectivity);
-    for (int lane = 0; lane < 4; lane++) {
-        if (own->ranges_m)
-            own->ranges_m[row] = ranges_m[lane];
-        if (own->reflectivities)
-            own->reflectivities[row] = (uint16_t)reflectivities[lane];
-        row += kept >> lane & 1;
-    }
-}
-
-/* The same to slots, as `store_slots`. */
-static inline void store_slot_extras(const Column *own, int64_t slot, __m128i mask, __m128 range_m,
-                                     __m128i reflectivity)
-{
-    /* To 16 bits: signed numbers are not limited when they are packed. */
-    const __m128i wide = _mm_srai_epi32(_mm_slli_epi32(_mm_and_si128(mask, reflectivity), 16), 16);
-    if (own->ranges_m)
-        _mm_storeu_ps(own->ranges_m + slot, or_nan(mask, range_m));
-    if (own->reflectivities)
-        _mm_storel_epi64((__m128i *)(own->reflectivities + slot), _mm_packs_epi32(wide, wide));
-}
-
-static inline __m128i field_of(__m128i words, __m128i shift, __m128i mask)
-{
-    return _mm_and_si128(_mm_srl_epi32(words, shift), mask);
-}
-
-/* Four beams of a run: their pixels begin at `from`; with `is_read` their words are in `near` and
-   `levels`. Return the next row. */
-FOR_CONSTANTS int64_t decode_four(const Scan *scan, const Group *group, const Column *own,
-                                  int64_t kind, int64_t step, int is_plain, int has_moves,
-                                  int is_read, int is_organized, const uint8_t *from,
-                                  const uint32_t *near, const uint32_t *levels, int64_t beam,
-                                  int64_t row, int64_t *counts)
-{
-    /* The distance is in the first word, as fields are listed. */
-    const __m128i first = is_read ? _mm_load_si128((const __m128i *)near)
-                                  : load_four(from + own->distance_byte, step);
-    __m128i value = _mm_srl_epi32(first, own->shift);
-    if ((!is_plain || kind == TURNING) && own->is_big) {
-        const __m128i byte = _mm_set1_epi32(0xFF);
-        value = _mm_or_si128(_mm_slli_epi32(_mm_and_si128(value, byte), 8),
-                             _mm_and_si128(_mm_srli_epi32(value, 8), byte));
-    }
-    value = _mm_and_si128(value, own->mask);
-    const __m128i found = _mm_cmpgt_epi32(value, own->silent);
-    int kept = _mm_movemask_ps(_mm_castsi128_ps(found));
-    if (!kept && !is_organized)
-        return row;
-    const __m128 range_m = _mm_div_ps(
-        _mm_mul_ps(_mm_cvtepi32_ps(_mm_and_si128(value, found)), own->factor), own->divisor);
-    if (!is_plain && own->is_filtered)
-        counts[FOUND] += NEXT[kept][3];
-    if (!is_plain && own->is_limited) {
-        kept &= _mm_movemask_ps(_mm_and_ps(_mm_cmpge_ps(range_m, own->low_m),
-                                           _mm_cmple_ps(range_m, own->high_m)));
-        if (!kept && !is_organized)
-            return row;
-    }
-    if (!is_plain && own->has_boxes)
-        counts[IN_RANGE] += NEXT[kept][3];
-    __m128 xyz[3];
-    if (kind == UPRIGHT)
-        place_tabled(own, UPRIGHT_BEAMS, UPRIGHT_VECTORS, beam, range_m, xyz);
-    else if (kind == TABLED)
-        place_tabled(own, own->width, ALL_VECTORS, beam, range_m, xyz);
-    else
-        place_turning(own, own->width, beam, range_m, xyz);
-    if (!is_plain && own->has_boxes)
-        kept &= outside_boxes(scan, xyz);
-    if (has_moves)
-        move_four(own->moves, xyz);
-    __m128i second = first;
-    if (is_read)
-        second = _mm_load_si128((const __m128i *)levels);
-    else if (own->level_word)
-        second = load_four(from + own->level_byte, step);
-    const __m128i level = field_of(second, own->level_shift, own->level_mask);
-    if (!is_plain && own->has_extras) {
-        __m128i reflectivity = _mm_setzero_si128();
-        if (group->has_reflectivity)
-            reflectivity = field_of(load_four(from + own->reflectivity_byte, step),
-                                    own->reflectivity_shift, own->reflectivity_mask);
-        if (is_organized)
-            store_slot_extras(own, beam, mask_of(kept), range_m, reflectivity);
-        else
-            store_extras(own, row, kept, range_m, reflectivity);
-    }
-    const __m128i *labels = (const __m128i *)(own->words + beam);
-    const __m128i low = _mm_add_epi64(_mm_loadu_si128(labels), own->offsets);
-    const __m128i high = _mm_add_epi64(_mm_loadu_si128(labels + 1), own->offsets);
-    if (!is_organized)
-        return store_kept(own->point, own->label, row, kept, xyz[0], xyz[1], xyz[2],
-                          _mm_cvtepi32_ps(level), low, high);
-    store_slots(own->point, own->label, beam, mask_of(kept), xyz[0], xyz[1], xyz[2],
-                _mm_cvtepi32_ps(level), low, high, own->empty);
-    return row + NEXT[kept][3];
-}
-
-/* Add the counts of a column; points: of it. */
-static inline void add_counts(const Column *own, int64_t points, const int64_t *own_counts,
-                              int64_t *counts)
-{
-    /* What no filter leaves out are points. */
-    const int64_t found = own->is_filtered ? own_counts[FOUND] : points;
-    counts[FOUND] += found;
-    counts[DISTINCT] += found;
-    counts[IN_RANGE] += own->has_boxes ? own_counts[IN_RANGE] : points;
-    counts[OUTSIDE_BOXES] += points;
-}
-
-/* All runs of a column; with constant steps and kinds the compiler leaves out what is not used. */
-FOR_CONSTANTS int64_t decode_runs(const Scan *scan, const Group *group, const Column *own,
-                                  int64_t kind, int64_t step, int is_plain, int has_moves,
-                                  int is_organized, const uint8_t *record, int64_t row,
-                                  int64_t *counts)
-{
-    int64_t own_counts[COUNTS] = {0};
-    const int64_t first_row = row;
-    const int64_t *run = group->runs;
-    for (int64_t number = 0; number < group->run_count; number++, run += 3) {
-        const uint8_t *from = record + run[0];
-        const int64_t beams = run[2], first_beam = run[1];
-        _Alignas(64) uint32_t near[MOST_BEAMS], levels[MOST_BEAMS];
-        if (kind != TURNING) {
-            /* Reads the column as a whole, since the passes below would wait for each piece. */
-            gather_every(from + own->distance_byte, step, beams, near);
-            if (own->level_word)
-                gather_every(from + own->level_byte, step, beams, levels);
-        }
-        for (int64_t beam = 0; beam < beams; beam += 4)
-            row = decode_four(scan, group, own, kind, step, is_plain, has_moves, kind != TURNING,
-                              is_organized, from + beam * step, near + beam,
-                              (own->level_word ? levels : near) + beam, first_beam + beam, row,
-                              own_counts);
-    }
-    add_counts(own, row - first_row, own_counts, counts);
-    return row;
-}
-
-/* The same of a column whose beams come in another order than their pixels. */
-FOR_CONSTANTS int64_t decode_places(const Scan *scan, const Group *group, const Column *own,
-                                    int64_t kind, int is_plain, const uint8_t *record, int64_t row,
-                                    int64_t *counts)
-{
-    int64_t own_counts[COUNTS] = {0};
-    const int64_t first_row = row;
-    _Alignas(64) uint32_t near[MOST_BEAMS], levels[MOST_BEAMS];
-    /* cppcheck-suppress ctuuninitvar ; decode_fused() sets it, field by field */
-    gather_at(record + own->distance_byte, group->places, group->slots, near);
-    if (own->level_word)
-        gather_at(record + own->level_byte, group->places, group->slots, levels);
-    for (int64_t beam = 0; beam < group->slots; beam += 4)
-        row = decode_four(scan, group, own, kind, 0, is_plain, own->has_moves, 1, 0, record,
-                          near + beam, (own->level_word ? levels : near) + beam, beam, row,
-                          own_counts);
-    add_counts(own, row - first_row, own_counts, counts);
-    return row;
-}
-
-/* What the beams of a column of a group that `fits_fours` have in common; known: row of its labels;
-   slot: first one of its row in an organized scan, 0 in a dense one. */
-static inline void set_column(const Scan *scan, const Group *group, int64_t member, int64_t column,
-                       int64_t known, int64_t slot, Column *own)
-{
-    const int64_t width = group->width, encoder = scan->encoder[column];
-    const Field *fields = group->fields;
-    own->distance_byte = group->word_bytes[fields[DISTANCE].word];
-    own->level_word = (int)fields[INTENSITY].word;
-    own->level_byte = group->word_bytes[fields[INTENSITY].word];
-    own->reflectivity_byte = group->word_bytes[fields[REFLECTIVITY].word];
-    own->is_big = (int)fields[DISTANCE].is_big;
-    own->mask = _mm_set1_epi32((int32_t)fields[DISTANCE].mask);
-    own->level_mask = _mm_set1_epi32((int32_t)fields[INTENSITY].mask);
-    own->reflectivity_mask = _mm_set1_epi32((int32_t)fields[REFLECTIVITY].mask);
-    own->shift = _mm_cvtsi32_si128((int32_t)fields[DISTANCE].shift);
-    own->level_shift = _mm_cvtsi32_si128((int32_t)fields[INTENSITY].shift);
-    own->reflectivity_shift = _mm_cvtsi32_si128((int32_t)fields[REFLECTIVITY].shift);
-    own->silent = _mm_set1_epi32((int32_t)group->silent);
-    own->factor = _mm_set1_ps(group->scale[0]);
-    own->divisor = _mm_set1_ps(group->scale[1]);
-    own->offsets = _mm_set1_epi64x(scan->stamp_ns[column] - scan->start_ns);
-    own->words = group->labels + known * width;
-    own->direction = group->direction + member * 9 * width;
-    own->reach = group->reach ? group->reach + member * width : 0;
-    own->is_limited = group->limits_m != 0;
-    own->low_m = _mm_set1_ps(own->is_limited ? group->limits_m[2 * member] : 0);
-    own->high_m = _mm_set1_ps(own->is_limited ? group->limits_m[2 * member + 1] : 0);
-    own->has_boxes = scan->box_count > 0;
-    own->has_extras = scan->range_m || scan->reflectivity;
-    own->point = scan->point + 4 * slot;
-    own->label = scan->label + slot;
-    own->ranges_m = scan->range_m ? scan->range_m + slot : 0;
-    own->reflectivities = scan->reflectivity ? scan->reflectivity + slot : 0;
-    own->empty = _mm_set1_epi64x(label_of_empty(own->words[0]));
-    own->width = width;
-    own->is_filtered = own->is_limited || own->has_boxes;
-    own->has_moves = scan->moves != 0;
-    for (int number = 0; own->has_moves && number < 12; number++)
-        own->moves[number] = _mm_set1_ps(scan->moves[12 * column + number]);
-    own->is_plain = !own->is_filtered && !own->has_extras;
-    if (group->kind == TABLED) {
-        const int64_t at = table_row(group, member, encoder);
-        own->cosine = _mm_set1_ps(group->cosine[at]);
-        own->sine = _mm_set1_ps(group->sine[at]);
-        for (int axis = 0; axis < 3; axis++)
-            own->origin[axis] = _mm_set1_ps(group->origin[3 * at + axis]);
-        own->is_upright = width == UPRIGHT_BEAMS && !own->has_moves
-            && group->used[member] == UPRIGHT_VECTORS;
-        return;
-    }
-    own->cosine = _mm_set1_ps(group->cosine[column]);
-    own->sine = _mm_set1_ps(group->sine[column]);
-    own->origins = group->origin + member * 9 * width;
-    own->used = group->used[member];
-    const float speed = speed_of(encoder);
-    own->speed = _mm_set1_ps(speed);
-    own->firing_ns = group->firing_ns && speed != 0.0f ? group->firing_ns + known * width : 0;
-}
-
-/* A column of a dense scan. Return the next row. */
-static int64_t decode_dense(const Scan *scan, const Group *group, int64_t member, int64_t column,
-                            int64_t known, const uint8_t *record, int64_t row)
-{
-    Column own;
-    set_column(scan, group, member, column, known, 0, &own);
-    int64_t *counts = group->counts + member * COUNTS;
-    const int has_moves = own.has_moves;
-    if (group->kind == TABLED) {
-        if (group->places)
-            return decode_places(scan, group, &own, TABLED, 0, record, row, counts);
-        const int is_short = !own.is_big && group->step == 4;
-        const int is_long = !own.is_big && group->step == 12 && own.is_plain;
-        if (is_short && own.is_plain && own.is_upright)
-            return decode_runs(scan, group, &own, UPRIGHT, 4, 1, 0, 0, record, row, counts);
-        if (is_short && own.is_upright)
-            return decode_runs(scan, group, &own, UPRIGHT, 4, 0, 0, 0, record, row, counts);
-        if (is_long && own.is_upright)
-            return decode_runs(scan, group, &own, UPRIGHT, 12, 1, 0, 0, record, row, counts);
-        if (is_short && own.is_plain && has_moves)
-            return decode_runs(scan, group, &own, TABLED, 4, 1, 1, 0, record, row, counts);
-        if (is_short && own.is_plain)
-            return decode_runs(scan, group, &own, TABLED, 4, 1, 0, 0, record, row, counts);
-        if (is_long && has_moves)
-            return decode_runs(scan, group, &own, TABLED, 12, 1, 1, 0, record, row, counts);
-        if (is_long)
-            return decode_runs(scan, group, &own, TABLED, 12, 1, 0, 0, record, row, counts);
-        return decode_runs(scan, group, &own, TABLED, group->step, 0, has_moves, 0, record, row,
-                           counts);
-    }
-    if (group->places && own.is_plain)
-        return decode_places(scan, group, &own, TURNING, 1, record, row, counts);
-    if (group->places)
-        return decode_places(scan, group, &own, TURNING, 0, record, row, counts);
-    if (own.is_plain && group->step == 3 && has_moves)
-        return decode_runs(scan, group, &own, TURNING, 3, 1, 1, 0, record, row, counts);
-    if (own.is_plain && group->step == 3)
-        return decode_runs(scan, group, &own, TURNING, 3, 1, 0, 0, record, row, counts);
-    return decode_runs(scan, group, &own, TURNING, group->step, 0, has_moves, 0, record, row,
-                       counts);
-}
-
-/* A column of an organized scan whose slots are beams. Return `row` and the number of points. */
-static int64_t decode_slots(const Scan *scan, const Group *group, int64_t member, int64_t column,
-                            int64_t known, const uint8_t *record, int64_t row)
-{
-    const int64_t slot = organized_row(scan, column) * mlbatch_row_step(scan);
-    const Row rest = row_at(scan, slot);
-    Column own;
-    memset(&own, 0, sizeof own);
-    set_column(scan, group, member, column, known, slot, &own);
-    empty_slots(&rest, group->beams, scan->row_slots, label_of_empty(own.words[0]));
-    int64_t *counts = group->counts + member * COUNTS;
-    const int is_usual = !own.is_big && own.is_upright;
-    if (is_usual && own.is_plain && group->step == 4)
-        return decode_runs(scan, group, &own, UPRIGHT, 4, 1, 0, 1, record, row, counts);
-    if (is_usual && group->step == 4)
-        return decode_runs(scan, group, &own, UPRIGHT, 4, 0, 0, 1, record, row, counts);
-    if (is_usual && own.is_plain && group->step == 12)
-        return decode_runs(scan, group, &own, UPRIGHT, 12, 1, 0, 1, record, row, counts);
-    if (group->kind == TABLED)
-        return decode_runs(scan, group, &own, TABLED, group->step, 0, own.has_moves, 1, record,
-                           row, counts);
-    return decode_runs(scan, group, &own, TURNING, group->step, 0, own.has_moves, 1, record, row,
-                       counts);
-}
-#endif
-
-#if defined(__SSE2__)
-static inline __m128 turn_four(const __m128 *row, __m128 x, __m128 y, __m128 z)
-{
-    const __m128 sum = _mm_add_ps(_mm_mul_ps(x, row[0]), _mm_mul_ps(y, row[1]));
-    return _mm_add_ps(_mm_add_ps(sum, _mm_mul_ps(z, row[2])), row[3]);
-}
-
-/* Points that a driver computed, from their planes to rows of a dense scan, four at a time: the
-   operations of `read_placed`, `mark`, `move_planes`, `label` and `emit_fours`. For `fits_places`.
-   Return the next row. */
-static int64_t decode_placed(const Scan *scan, const Group *group, int64_t member, int64_t column,
-                             int64_t known, const uint8_t *record, int64_t row)
-{
-    enum { ROWS = 3, STEP = 4 };
-    const int64_t beams = group->beams;
-    const float *planes = (const float *)(const void *)(record + group->runs[0]);
-    const float *turn = group->direction + 9 * member, *shift_m = group->origin + 3 * member;
-    const float *moves = scan->moves ? scan->moves + 12 * column : 0;
-    __m128 turns[ROWS][STEP], moved[ROWS][STEP];
-    for (int axis = 0; axis < ROWS; axis++)
-        for (int step = 0; step < STEP; step++) {
-            turns[axis][step] = _mm_set1_ps(step < ROWS ? turn[ROWS * axis + step]
-                                                        : shift_m[axis]);
-            moved[axis][step] = _mm_set1_ps(moves ? moves[STEP * axis + step] : 0.0f);
-        }
-    const float *limits_m = group->limits_m ? group->limits_m + 2 * member : 0;
-    const __m128 low_m = _mm_set1_ps(limits_m ? limits_m[0] : 0.0f);
-    const __m128 high_m = _mm_set1_ps(limits_m ? limits_m[1] : 0.0f);
-    const __m128i offset_ns = _mm_set1_epi64x(scan->stamp_ns[column] - scan->start_ns);
-    const int64_t *words = group->labels + known * group->width;
-    const int64_t first_row = row;
-    int64_t found = 0;
-    for (int64_t beam = 0; beam < beams; beam += 4) {
-        const __m128 x = _mm_loadu_ps(planes + beam);
-        const __m128 y = _mm_loadu_ps(planes + beams + beam);
-        const __m128 z = _mm_loadu_ps(planes + 2 * beams + beam);
-        const __m128 range_m = _mm_sqrt_ps(_mm_add_ps(
-            _mm_add_ps(_mm_mul_ps(x, x), _mm_mul_ps(y, y)), _mm_mul_ps(z, z)));
-        __m128 keep = _mm_cmpgt_ps(range_m, _mm_setzero_ps());
-        found += NEXT[_mm_movemask_ps(keep)][3];
-        if (limits_m)
-            keep = _mm_and_ps(keep, _mm_and_ps(_mm_cmpge_ps(range_m, low_m),
-                                               _mm_cmple_ps(range_m, high_m)));
-        const int kept = _mm_movemask_ps(keep);
+    uint8_t *points = (uint8_t *)(scan->point + POINT * row);
+    uint8_t *labels = (uint8_t *)(scan->label + row);
+    for (int64_t element = 0; element < elements; element += LANES) {
+        int kept = bits_of(load_keep(planes->keep + element));
         if (!kept)
             continue;
-        __m128 body[ROWS];
-        for (int axis = 0; axis < ROWS; axis++)
-            body[axis] = turn_four(turns[axis], x, y, z);
-        if (moves) {
-            const __m128 before[] = {body[0], body[1], body[2]};
-            for (int axis = 0; axis < ROWS; axis++)
-                body[axis] = turn_four(moved[axis], before[0], before[1], before[2]);
+        Floats vectors[4];
+        transpose(planes, element, 0, vectors);
+        for (int part = 0; part < LANES; part += 4, kept >>= 4) {
+            const uint8_t *next = NEXT[kept & 15];
+            for (int lane = 0; lane < 4; lane++) {
+                const int64_t twice = lane ? next[lane - 1] : 0;
+                const int64_t label = words[element + part + lane] + offset_ns;
+                memcpy(points + 8 * twice, (const float *)(vectors + lane) + part, sizeof(Point));
+                memcpy(labels + 4 * twice, &label, sizeof label);
+            }
+            points += 8 * (size_t)next[3];
+            labels += 4 * (size_t)next[3];
         }
-        const __m128i *own = (const __m128i *)(words + beam);
-        row = store_kept(scan->point, scan->label, row, kept, body[0], body[1], body[2],
-                         _mm_loadu_ps(planes + 3 * beams + beam),
-                         _mm_add_epi64(_mm_loadu_si128(own), offset_ns),
-                         _mm_add_epi64(_mm_loadu_si128(own + 1), offset_ns));
     }
-    int64_t *counts = group->counts + member * COUNTS;
-    counts[FOUND] += found;
-    counts[DISTINCT] += found;
-    counts[IN_RANGE] += row - first_row;
-    counts[OUTSIDE_BOXES] += row - first_row;
-    return row;
+    return (int64_t *)(void *)labels - scan->label;
 }
 
-/* Whether `decode_placed` does all that a scan asks for. */
-static int fits_places(const Scan *scan, const Group *group)
+/* All points of a column. */
+static void transpose_all(int64_t elements, int blanks, float (*out)[POINT], const Planes *planes)
 {
-    return group->kind == PLACED && group->beams % 4 == 0 && group->slots == group->beams
-        && group->typed == NOT_TYPED && !group->order && !scan->row_slots && !scan->box_count
-        && !scan->range_m && !scan->reflectivity;
-}
-
-/* Kept elements in their order, four at a time; the slots are a multiple of four. */
-static int64_t emit_fours(const Scan *scan, const Group *group, int64_t row, const Planes *planes)
-{
-    for (int64_t beam = 0; beam < group->slots; beam += 4) {
-        uint32_t marks;
-        memcpy(&marks, planes->keep + beam, 4);
-        /* One bit a byte: 1, 0x100, 0x10000, 0x1000000. */
-        const int kept = (int)((marks | marks >> 7 | marks >> 14 | marks >> 21) & 15);
-        if (!kept)
-            continue;
-        const __m128i *labels = (const __m128i *)(planes->label + beam);
-        row = store_kept(scan->point, scan->label, row, kept, _mm_load_ps(planes->x + beam),
-                         _mm_load_ps(planes->y + beam), _mm_load_ps(planes->z + beam),
-                         _mm_load_ps(planes->level + beam), _mm_load_si128(labels),
-                         _mm_load_si128(labels + 1));
+    for (int64_t element = 0; element < elements; element += LANES) {
+        Floats vectors[4];
+        transpose(planes, element, blanks, vectors);
+        for (int lane = 0; lane < LANES; lane++)
+            memcpy(out[element + lane], (const float *)(vectors + lane % 4) + lane / 4 * 4,
+                   sizeof(Point));
     }
-    return row;
 }
-#endif
 
-/* Kept elements in order of output. Returns the next row. */
+/* The same in another order, or of a number of elements that is no multiple of LANES. */
 static int64_t emit_ordered(const Scan *scan, const Group *group, const int64_t *order,
-                            int64_t first_row, const Planes *planes)
+                            const int64_t *labels, int64_t offset_ns, int64_t row,
+                            const Planes *planes)
 {
-    int64_t row = first_row;
+    float *restrict point = scan->point;
+    int64_t *restrict label = scan->label;
     for (int64_t number = 0; number < group->slots; number++) {
         const int64_t element = order ? order[number] : number;
-        put_point(scan->point + 4 * row, planes, element);
-        scan->label[row] = planes->label[element];
-        row += planes->keep[element];
+        memcpy(point + POINT * row, planes->point[element], sizeof planes->point[element]);
+        label[row] = labels[element] + offset_ns;
+        row -= planes->keep[element];
     }
     return row;
 }
 
 /* Ranges and reflectivities of the kept elements, in order of output. */
-static void emit_extras(const Scan *scan, const Group *group, const int64_t *order,
-                        int64_t first_row, const Planes *planes)
+static void emit_extras(const Scan *scan, const Group *group, const int64_t *order, int64_t row,
+                        const Planes *planes)
 {
-    int64_t row = first_row;
-    for (int64_t number = 0; scan->range_m && number < group->slots; number++) {
+    for (int64_t number = 0; number < group->slots; number++) {
         const int64_t element = order ? order[number] : number;
-        scan->range_m[row] = planes->range_m[element];
-        row += planes->keep[element];
-    }
-    row = first_row;
-    for (int64_t number = 0; scan->reflectivity && number < group->slots; number++) {
-        const int64_t element = order ? order[number] : number;
-        scan->reflectivity[row] = planes->reflectivity[element];
-        row += planes->keep[element];
+        if (scan->range_m)
+            scan->range_m[row] = planes->range_m[element];
+        if (scan->reflectivity)
+            scan->reflectivity[row] = group->has_reflectivity ? planes->reflectivity[element] : 0;
+        row -= planes->keep[element];
     }
 }
 
-/* The row of a column in an organized scan: every kept element to its slot, the others empty. */
-static int64_t emit_organized(const Scan *scan, const Group *group, int64_t column,
-                              const Planes *planes)
+/* A column of a dense scan. Return the next row. */
+static int64_t emit_dense(const Scan *scan, const Group *group, const int64_t *order,
+                          const int64_t *labels, int64_t offset_ns, int64_t row, Planes *planes)
 {
-    const int64_t width = group->width;
-    const Row row = row_at(scan, organized_row(scan, column) * mlbatch_row_step(scan));
-    empty_slots(&row, 0, scan->row_slots, label_of_empty(planes->label[0]));
-    int64_t count = 0;
-    for (int64_t which = 0; which < group->returns; which++)
-        for (int64_t element = which * width; element < which * width + group->beams; element++)
-            if (planes->keep[element]) {
+    if (scan->range_m || scan->reflectivity)
+        emit_extras(scan, group, order, row, planes);
+    if (!order && group->slots % LANES == 0)
+        return emit_natural(scan, group->slots, labels, offset_ns, row, planes);
+    transpose_all(group->returns * group->width, 0, planes->point, planes);
+    return emit_ordered(scan, group, order, labels, offset_ns, row, planes);
+}
+
+static float not_a_number(void)
+{
+    const int32_t bits = NAN_BITS;
+    float nan;
+    memcpy(&nan, &bits, sizeof nan);
+    return nan;
+}
+
+/* Number of the row of a column in the arrays of an organized scan. */
+static int64_t organized_row(const Scan *scan, int64_t column)
+{
+    return scan->records ? column % scan->near_columns : scan->first_number + column;
+}
+
+/* Labels of elements, those of empty slots where they are not kept. */
+static void to_labels(const int64_t *restrict words, int64_t offset_ns, int64_t empty,
+                      int64_t elements, const int32_t *restrict keep, int64_t *restrict labels)
+{
+    for (int64_t element = 0; element < elements; element++)
+        labels[element] = keep[element] ? words[element] + offset_ns : empty;
+}
+
+/* Ranges and reflectivities of a row of an organized scan. */
+static void emit_slot_extras(const Scan *scan, const Group *group, int64_t first,
+                             const Planes *planes)
+{
+    const float nan = not_a_number();
+    float *range_m = scan->range_m ? scan->range_m + first : 0;
+    uint16_t *reflectivity = scan->reflectivity ? scan->reflectivity + first : 0;
+    for (int64_t slot = group->slots; range_m && slot < scan->row_slots; slot++)
+        range_m[slot] = nan;
+    for (int64_t slot = group->slots; reflectivity && slot < scan->row_slots; slot++)
+        reflectivity[slot] = 0;
+    for (int64_t which = 0; which < group->returns && (range_m || reflectivity); which++)
+        for (int64_t beam = 0; beam < group->beams; beam++) {
+            const int64_t element = which * group->width + beam;
+            const int64_t slot = group->slot ? group->slot[element] : element;
+            const int is_kept = planes->keep[element] != 0;
+            if (range_m)
+                range_m[slot] = is_kept ? planes->range_m[element] : nan;
+            if (reflectivity)
+                reflectivity[slot] =
+                    is_kept && group->has_reflectivity ? planes->reflectivity[element] : 0;
+        }
+}
+
+/* The row of a column in an organized scan: every element to its slot, kept or empty. Return the
+   number of points. */
+static int64_t emit_organized(const Scan *scan, const Group *group, int64_t column,
+                              const int64_t *words, int64_t offset_ns, Planes *planes)
+{
+    const int64_t width = group->width, elements = group->returns * width;
+    const int64_t first = organized_row(scan, column) * mlbatch_row_step(scan);
+    const int64_t empty = (int64_t)((uint64_t)words[0] >> LIDAR_ID_BIT << LIDAR_ID_BIT);
+    const float nan = not_a_number();
+    float(*restrict point)[POINT] = (float(*)[POINT])(void *)(scan->point + POINT * first);
+    int64_t *restrict label = scan->label + first;
+    const int32_t *keep = planes->keep;
+    if (!group->slot && group->slots % LANES == 0) {
+        transpose_all(group->slots, 1, point, planes);
+        to_labels(words, offset_ns, empty, group->slots, keep, label);
+    } else {
+        transpose_all(elements, 1, planes->point, planes);
+        for (int64_t which = 0; which < group->returns; which++)
+            for (int64_t beam = 0; beam < group->beams; beam++) {
+                const int64_t element = which * width + beam;
                 const int64_t slot = group->slot ? group->slot[element] : element;
-                put_point(row.point + 4 * slot, planes, element);
-                row.labels[slot] = planes->label[element];
-                if (row.range_m)
-                    row.range_m[slot] = planes->range_m[element];
-                if (row.reflectivity)
-                    row.reflectivity[slot] = planes->reflectivity[element];
-                count++;
+                memcpy(point[slot], planes->point[element], sizeof point[slot]);
+                label[slot] = keep[element] ? words[element] + offset_ns : empty;
             }
-    return count;
+    }
+    for (int64_t slot = group->slots; slot < scan->row_slots; slot++) {
+        for (int value = 0; value < POINT; value++)
+            point[slot][value] = nan;
+        label[slot] = empty;
+    }
+    emit_slot_extras(scan, group, first, planes);
+    return count_kept(keep, elements);
 }
 
 /* -- columns ----------------------------------------------------------------------------------- */
@@ -1264,27 +877,21 @@ static const uint8_t *record_of(const Scan *scan, const Group *group, int64_t co
         + (index - row * ring->per_row) * ring->column_bytes;
 }
 
-static inline void prefetch(const void *from, int64_t bytes)
+/* Ask for what a later column needs: neighbours in a scan are far apart in memory. Return its
+   record, NULL: there is none. */
+static const uint8_t *prefetched(const Scan *scan, int64_t column)
 {
-#if defined(__SSE2__)
-    for (int64_t byte = 0; byte < bytes; byte += 64)
-        _mm_prefetch((const char *)from + byte, _MM_HINT_T0);
-#else
-    (void)from;
-    (void)bytes;
-#endif
-}
-
-/* Ask for what a later column needs: neighbours in a scan are far apart in memory. */
-static void prefetch_column(const Scan *scan, int64_t column)
-{
+    enum { LINE = 64 };
     if (column >= scan->columns)
-        return;
+        return 0;
     const int64_t number = scan->group_of[scan->sensor[column]];
     if (number < 0)
-        return;
+        return 0;
     const Group *group = scan->groups + number;
-    prefetch(record_of(scan, group, column), group->step * group->beams);
+    const uint8_t *record = record_of(scan, group, column);
+    for (int64_t byte = 0; byte < group->step * group->beams; byte += LINE)
+        __builtin_prefetch(record + byte);
+    return record;
 }
 
 static int64_t decode_column(const Scan *scan, const Group *group, int64_t member, int64_t column,
@@ -1296,17 +903,8 @@ static int64_t decode_column(const Scan *scan, const Group *group, int64_t membe
     const int64_t known = member * group->tables + table;
     const int64_t offset_ns = scan->stamp_ns[column] - scan->start_ns;
     group->counts[member * COUNTS + COLUMNS]++;
-#if defined(__SSE2__)
-    if (group->fits_fours && !scan->row_slots)
-        return decode_dense(scan, group, member, column, known, record, row);
-    if (group->fits_fours && scan->row_slots && !group->slot)
-        return decode_slots(scan, group, member, column, known, record, row);
-    if (fits_places(scan, group))
-        return decode_placed(scan, group, member, column, known, record, row);
-#endif
-    const int has_pixels = group->kind != PLACED && group->kind != COORDINATES;
-    for (int64_t which = 0; which < group->returns && has_pixels; which++)
-        read_return(group, record, which, planes);
+    if (group->kind != PLACED && group->kind != COORDINATES)
+        read_pixels(group, record, planes);
     switch (group->kind) {
     case PLACED: read_placed(group, member, record, planes); break;
     case COORDINATES: read_coordinates(group, member, record, planes); break;
@@ -1315,62 +913,54 @@ static int64_t decode_column(const Scan *scan, const Group *group, int64_t membe
     case TABLED: project_tabled(group, member, encoder, planes); break;
     default: project_turning(group, member, encoder, known, column, planes);
     }
-    mark(scan, group, member, planes);
-    if (scan->moves)
-        move_planes(scan->moves + 12 * column, group->returns * group->width, planes);
-    label(group, known, offset_ns, planes);
-    if (scan->row_slots)
-        return row + emit_organized(scan, group, column, planes);
+    const int is_filtered = has_filters(scan, group);
+    if (is_filtered)
+        mark(scan, group, member, planes);
+    if (scan->moves) {
+        const float *moves = scan->moves + 12 * column;
+        move(moves, 4, moves + 3, 4, group->returns * group->width, planes);
+    }
+    const int64_t *labels = labels_of(group, known, planes);
     const int64_t *order = group->order ? group->order + table * group->order_step : 0;
-    emit_extras(scan, group, order, row, planes);
-#if defined(__SSE2__)
-    if (group->kind == PLACED && group->slots % 4 == 0)
-        return emit_fours(scan, group, row, planes);
-#endif
-    return emit_ordered(scan, group, order, row, planes);
+    const int64_t next = scan->row_slots
+        ? row + emit_organized(scan, group, column, labels, offset_ns, planes)
+        : emit_dense(scan, group, order, labels, offset_ns, row, planes);
+    for (int which = FOUND; which < COUNTS && !is_filtered; which++)
+        group->counts[member * COUNTS + which] += next - row;
+    return next;
 }
-
-/* -- packed records ----------------------------------------------------------------------------- */
 
 /* Decode a column of a dense scan to packed records. Return the next row. */
 static int64_t pack_column(const Scan *scan, const Group *group, int64_t member, int64_t column,
-                           int64_t row, Planes *planes)
+                           const uint8_t *record, int64_t row, Planes *planes)
 {
     const Rows rows = {scan->point, scan->label, scan->range_m, scan->reflectivity, 1};
-    const int64_t count = decode_column(scan, group, member, column,
-                                        record_of(scan, group, column), 0, planes);
+    const int64_t count = decode_column(scan, group, member, column, record, 0, planes);
     mlbatch_pack(scan, &rows, count, scan->records + row * scan->record_bytes);
     return row + count;
 }
 
 /* Decode all columns of a scan, in their order; return the row after the last point (organized:
    the number of points). Sensors of no group are skipped. */
-EXPORT int64_t mlbatch_decode(const Scan *scan)
+static int64_t decode_columns(const Scan *scan)
 {
     enum { AHEAD = 2 };
     Planes planes;
-    memset(planes.words, 0, sizeof planes.words);
-    memset(planes.reflectivity, 0, sizeof planes.reflectivity);
-    int64_t row = scan->first_row, last_group = -1;
+    const uint8_t *records[AHEAD] = {prefetched(scan, 0), prefetched(scan, 1)};
+    int64_t row = scan->first_row;
     for (int64_t column = 0; column < scan->columns; column++) {
-        prefetch_column(scan, column + AHEAD);
+        const uint8_t *record = records[column % AHEAD];
+        records[column % AHEAD] = prefetched(scan, column + AHEAD);
         const int64_t sensor = scan->sensor[column];
-        const int64_t number = scan->group_of[sensor];
+        const int64_t number = scan->group_of[sensor], member = scan->member_of[sensor];
         if (number < 0)
             continue;
         const Group *group = scan->groups + number;
         const int64_t first = row;
-        if (number != last_group && last_group >= 0) {
-            /* What another group left in beams that this one does not have. */
-            memset(planes.words, 0, sizeof planes.words);
-            memset(planes.reflectivity, 0, sizeof planes.reflectivity);
-        }
-        last_group = number;
         if (scan->records && !scan->row_slots)
-            row = pack_column(scan, group, scan->member_of[sensor], column, row, &planes);
+            row = pack_column(scan, group, member, column, record, row, &planes);
         else
-            row = decode_column(scan, group, scan->member_of[sensor], column,
-                                record_of(scan, group, column), row, &planes);
+            row = decode_column(scan, group, member, column, record, row, &planes);
         if (scan->records && scan->row_slots
             && (column % scan->near_columns == scan->near_columns - 1
                 || column == scan->columns - 1))
@@ -1381,3 +971,36 @@ EXPORT int64_t mlbatch_decode(const Scan *scan)
     }
     return row;
 }
+
+#if LANES == 4
+#if defined(MLBATCH_WIDE)
+static int has_wide;
+
+/* Whether processor and operating system have AVX2, when the library is loaded; what compilers
+   offer for it is not in all of them (Zig's denies always). */
+__attribute__((constructor)) static void find_wide(void)
+{
+    enum { SAVED = 6 };
+    uint32_t a, b, c, d, saved, rest;
+    if (!__get_cpuid(1, &a, &b, &c, &d) || !(c & bit_OSXSAVE))
+        return;
+    __asm__("xgetbv" : "=a"(saved), "=d"(rest) : "c"(0));
+    if ((saved & SAVED) == SAVED && __get_cpuid_count(7, 0, &a, &b, &c, &d))
+        has_wide = (b & bit_AVX2) != 0;
+}
+#endif
+
+EXPORT int64_t mlbatch_decode(const Scan *scan)
+{
+#if defined(MLBATCH_WIDE)
+    if (has_wide)
+        return mlbatch_decode_wide(scan);
+#endif
+    return decode_columns(scan);
+}
+#else
+int64_t mlbatch_decode_wide(const Scan *scan)
+{
+    return decode_columns(scan);
+}
+#endif

@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from mlbatch.native import library_path
 
-_ABI = 12
+_ABI = 13
 _WORD = ctypes.c_int64
 _ADDRESS = ctypes.c_void_p
 _NUMBER = ctypes.c_double
@@ -108,7 +108,6 @@ class Group(ctypes.Structure):
         ("dark_count", _WORD),
         ("dark", _ADDRESS),
         ("has_reflectivity", _WORD),
-        ("places", _ADDRESS),
         ("rings", _ADDRESS),
         ("direction", _ADDRESS),
         ("origin", _ADDRESS),
@@ -139,7 +138,6 @@ class Group(ctypes.Structure):
         ("slot", _ADDRESS),
         ("typed", _WORD),
         ("sends_twice", _WORD),
-        ("fits_fours", _WORD),
         ("drops_repeated", _WORD),
         ("limits_m", _ADDRESS),
         ("counts", _ADDRESS),

@@ -16,7 +16,7 @@
 #endif
 
 /* To be changed with every change of a struct or of a signature. */
-#define MLBATCH_ABI 12
+#define MLBATCH_ABI 13
 
 #if defined(_WIN32)
 #define EXPORT __declspec(dllexport)
@@ -29,6 +29,11 @@
 #define FOR_CONSTANTS static inline __attribute__((always_inline))
 #else
 #define FOR_CONSTANTS static inline
+#endif
+
+/* Whether `decode_wide.c` is compiled, the loops for AVX2; MLBATCH_NARROW: tests do without. */
+#if defined(__x86_64__) && !defined(MLBATCH_NARROW)
+#define MLBATCH_WIDE
 #endif
 
 /* Limits of the scratch arrays. */
@@ -107,9 +112,6 @@ typedef struct {
     int64_t dark_count;
     const int64_t *dark; /* (dark_count,): channels without returns */
     int64_t has_reflectivity;
-    /* (slots,): first bytes of the pixels in order of output, in which beams then are everywhere;
-       only of one return without reflectivities, for dense scans. NULL: as in `runs`. */
-    const int64_t *places;
     Ring *rings; /* (members,) */
     /* Vectors of the directions, (members, 3 vectors, 3 axes, width).
        TABLED: cosine and sine (rows,), origin (rows, 3), first_row (members,).
@@ -154,11 +156,9 @@ typedef struct {
     const int64_t *labels; /* (members * T, E): words of 8 bytes, time 0 */
     const int64_t *order;  /* (T, slots) or NULL: elements in order of output */
     int64_t order_step;    /* from table to table; 0: one for all */
-    const int64_t *slot;   /* (E,): slot in an organized row; NULL: `fits_fours`, the beam */
+    const int64_t *slot;   /* (E,): slot in an organized row; NULL: the beam */
     int64_t typed;
     int64_t sends_twice;
-    /* One return, none dark, in fours: in runs in the order of the channels, or with `places`. */
-    int64_t fits_fours;
     int64_t drops_repeated;
     const float *limits_m; /* (members, 2) or NULL */
     int64_t *counts;       /* (members, COUNTS), added to */
@@ -239,6 +239,9 @@ typedef struct {
     const uint16_t *reflectivity;
     int64_t step;
 } Rows;
+
+/* `mlbatch_decode` by wider vectors; `decode_wide.c`. */
+int64_t mlbatch_decode_wide(const Scan *scan);
 
 /* Pack so many points to records; `pack.c`. */
 EXPORT void mlbatch_pack(const Scan *scan, const Rows *rows, int64_t count, uint8_t *record);

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import ctypes
 import json
+import shutil
+import subprocess
 import weakref
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, cast
 
@@ -38,14 +41,16 @@ from mlbatch.writers.point_layouts import (
     ROWS_NUSCENES,
     ROWS_TIME,
 )
-from tests.builders.engines import BOXES_M, MOST_COLUMNS, Pair
+from tests.builders.engines import BOXES_M, MOST_COLUMNS, Pair, assert_same
 from tests.builders.ouster import OusterSpec, metadata_json
+from tests.contract.tree import PACKAGE
 from tests.golden import test_every_model as models
 from tests.reference.decoder import readings_of, record_of
 from tests.reference.records import check_records
 
 START_NS = 1_800_000_000_000_000_000
 END_NS = 1_800_000_000_100_000_000
+HEADER = ScanHeader(0, 0, START_NS, END_NS, True, 0)
 # Tilted, level, where the vehicle is, and upside down, with zeros of both signs: sensors that are
 # decoded together differ in these.
 POSES = (
@@ -213,37 +218,83 @@ class Packing:
             assert packed.totals.second_returns == farther
 
 
-def check(lidars: list[Lidar], case: Case) -> None:
-    """Decode the same columns, twice, by both decoders."""
-    rng = np.random.default_rng(case.seed)
-    rings = [filled(lidar, rng) for lidar in lidars]
-    boxes_m = np.array(BOXES_M if case.is_cut else ()).reshape(-1, 6)
-    infos = []
-    sources = []
-    base = 0
-    for number, (lidar, (ring, _)) in enumerate(zip(lidars, rings, strict=True)):
-        pose = POSES[(case.seed + number) % len(POSES)]
-        low_m, high_m = (1.0 + number, 60.0) if case.is_cut else (0.0, float("inf"))
-        sources.append(Source(lidar, ring, pose, base, low_m, high_m, case.keeps_repeated))
-        infos.append(SensorInfo("one", lidar.model, lidar.channels, lidar.returns, base, pose))
-        base += lidar.channels
-    info = RunInfo(tuple(infos), "base_link", "10", "utc", 1, case.layout)
-    pair = Pair(info, sources, boxes_m, case.extras)
-    names = [name for name in PACKED if name != "las" or case.layout == "dense"]
-    packing = Packing(info, sources, boxes_m, names[case.seed % len(names)])
-    for _ in range(2):
-        sensor = rng.integers(0, len(lidars), case.columns)
-        place, word = np.empty((2, case.columns), np.int64)
-        for number, (lidar, (_, places)) in enumerate(zip(lidars, rings, strict=True)):
+class Drawn:
+    """Sensors with any bytes in their rings, and windows of their columns."""
+
+    def __init__(self, lidars: list[Lidar], case: Case) -> None:
+        self._case = case
+        self._lidars = lidars
+        self._rng = np.random.default_rng(case.seed)
+        rings = [filled(lidar, self._rng) for lidar in lidars]
+        self._places = [places for _, places in rings]
+        self.boxes_m = np.array(BOXES_M if case.is_cut else ()).reshape(-1, 6)
+        infos = []
+        self.sources = []
+        base = 0
+        for number, (lidar, (ring, _)) in enumerate(zip(lidars, rings, strict=True)):
+            pose = POSES[(case.seed + number) % len(POSES)]
+            low_m, high_m = (1.0 + number, 60.0) if case.is_cut else (0.0, float("inf"))
+            source = Source(lidar, ring, pose, base, low_m, high_m, case.keeps_repeated)
+            self.sources.append(source)
+            infos.append(SensorInfo("one", lidar.model, lidar.channels, lidar.returns, base, pose))
+            base += lidar.channels
+        self.info = RunInfo(tuple(infos), "base_link", "10", "utc", 1, case.layout)
+
+    def columns(self) -> WindowColumns:
+        """Columns of all sensors, of a window from START_NS on."""
+        rng, count = self._rng, self._case.columns
+        sensor = rng.integers(0, len(self._lidars), count)
+        place, word = np.empty((2, count), np.int64)
+        for number, (lidar, places) in enumerate(zip(self._lidars, self._places, strict=True)):
             own = sensor == number
             place[own] = rng.choice(places, int(own.sum()))
             word[own] = words_of(lidar, rng, int(own.sum()))
-        stamp_ns = np.sort(rng.integers(START_NS, END_NS, case.columns))
-        columns = WindowColumns(stamp_ns, sensor, place, word)
-        header = ScanHeader(0, 0, START_NS, END_NS, True, 0)
+        stamp_ns = np.sort(rng.integers(START_NS, END_NS, count))
+        return WindowColumns(stamp_ns, sensor, place, word)
+
+
+def check(lidars: list[Lidar], case: Case) -> None:
+    """Decode the same columns, twice, by both decoders."""
+    drawn = Drawn(lidars, case)
+    rng = np.random.default_rng(case.seed)
+    pair = Pair(drawn.info, drawn.sources, drawn.boxes_m, case.extras)
+    names = [name for name in PACKED if name != "las" or case.layout == "dense"]
+    name = names[case.seed % len(names)]
+    packing = Packing(drawn.info, drawn.sources, drawn.boxes_m, name)
+    for _ in range(2):
+        columns = drawn.columns()
         few = np.sort(rng.permutation(case.columns)[:MOST_COLUMNS])
-        pair.check(columns.take(few), header)
-        packing.check(columns, header)
+        pair.check(columns.take(few), HEADER)
+        packing.check(columns, HEADER)
+
+
+# Lanes of the baseline of a processor, and another compiler, where it is installed.
+@pytest.mark.parametrize("words", [("cc", "-DMLBATCH_NARROW"), ("clang",)], ids=" ".join)
+@pytest.mark.parametrize("layout", ["dense", "organized"])
+def test_all_builds_give_the_same_bytes(
+    words: tuple[str, ...], layout: str, others: list[Lidar], tmp_path: Path
+) -> None:
+    if shutil.which(words[0]) is None:
+        pytest.skip(f"{words[0]} is not installed")
+    path = tmp_path / "other.so"
+    flags = ["-std=c11", "-O3", "-ffp-contract=off", "-fPIC", "-shared", "-o", str(path)]
+    sources = [str(one) for one in sorted((PACKAGE / "native").glob("*.c"))]
+    subprocess.run([*words, *flags, *sources], check=True)
+    other = ctypes.CDLL(str(path))
+    other.mlbatch_decode.restype = ctypes.c_int64
+    lidars = [*others, level_sensor("RNG15_RFL8_NIR8"), ouster("RNG19_RFL8_SIG16_NIR16_DUAL", 16)]
+    for seed, extras in enumerate((frozenset[str](), EXTRAS, EXTRAS)):
+        case = Case(seed, 700, layout, extras, is_cut=seed == 1, keeps_repeated=seed == 2)
+        drawn = Drawn(lidars, case)
+        columns = drawn.columns()
+        moves = np.random.default_rng(seed).normal(size=(case.columns, 3, 4)).astype(np.float32)
+        decoders = [Decoder(drawn.info, drawn.sources, drawn.boxes_m, extras) for _ in range(2)]
+        cast(Any, decoders[1])._engine._library = other
+        for due in (columns, replace(columns, moves=moves)):
+            ours, theirs = (decoder.scan(due, HEADER) for decoder in decoders)
+            assert ours.points > 0
+            assert_same(ours, theirs)
+        assert decoders[0].counts == decoders[1].counts
 
 
 @given(cases, st.sampled_from(NAMES), st.sampled_from((16, 32, 64, 128)))
