@@ -11,17 +11,17 @@
 #endif
 
 enum { RECORD_BYTES = 16, IPV4_BYTES = 20, IPV6_BYTES = 40, UDP_BYTES = 8 };
-enum { IPV4_TYPE = 0x0800, IPV6_TYPE = 0x86DD };
+enum { IPV4_TYPE = 0x0800, IPV6_TYPE = 0x86DD, MPLS_TYPE = 0x8847, PPPOE_TYPE = 0x8864 };
 enum { MORE_FRAGMENTS = 0x2000, FRAGMENT_OFFSET = 0x1FFF, MOST_DATAGRAM_BYTES = 65535 };
 /* Protocols, and headers of IPv6. */
-enum { HOP_BY_HOP, UDP = 17, ROUTING = 43, FRAGMENT_HEADER, AUTHENTICATION = 51, DESTINATION = 60 };
-enum { MOBILITY = 135, HOST_IDENTITY = 139, SHIM6 };
+enum { HOP_BY_HOP, IPV4_IN_IP = 4, UDP = 17, IPV6_IN_IP = 41, ROUTING = 43, FRAGMENT_HEADER };
+enum { GRE = 47, AUTHENTICATION = 51, DESTINATION = 60, MOBILITY = 135, HOST_IDENTITY = 139, SHIM6 };
 /* No network adds more; the bounds keep a crafted packet cheap. */
 enum { MOST_TAGS = 8, MOST_HEADERS = 16 };
 /* Why a walk ends: `native/capture.py`. */
 enum { NO_ROOM, CUT, TOO_LONG };
 /* Headers of so many frames ahead are asked for: what was just read is in no near cache. */
-enum { FRAMES_AHEAD = 4 };
+enum { FRAMES_AHEAD = 4, LINE = 64 };
 
 static int64_t low(const uint8_t *byte)
 {
@@ -100,16 +100,30 @@ EXPORT int64_t mlbatch_walk(const uint8_t *data, int64_t begin, int64_t end, int
 /* -- frames to datagrams and fragments ----------------------------------------------------- */
 
 /* Verdicts on a frame. The first ones are counted: `CAPTURE_REASONS` of the ledger. */
-enum { NOT_IP, NOT_UDP, TRUNCATED, FRAGMENT, FRAGMENT_LOST, WHOLE, PART };
+enum { NOT_IP, NOT_UDP, TRUNCATED, FRAGMENT, FRAGMENT_LOST, WHOLE, PART, ODD };
 
-/* Content of an IP packet: a datagram from its UDP header on (WHOLE), or a piece of one (PART). */
+/* Content of a frame: a datagram from its UDP header on (WHOLE), a piece of one (PART), or (ODD)
+   something that an IP packet may be in. */
 typedef struct {
     uint64_t key[KEY_WORDS]; /* as of `FragmentSet`; a datagram has no identification */
     int64_t start;
     int64_t size;
     int64_t offset; /* of the piece */
     int64_t more;   /* whether pieces follow */
+    int64_t kind;   /* of what is odd: ethertype, protocol, or link type, less than 0 */
 } Packet;
+
+static int read_odd(int64_t at, int64_t kind, Packet *packet)
+{
+    packet->start = at;
+    packet->kind = kind;
+    return ODD;
+}
+
+static int is_tunnel(int protocol)
+{
+    return protocol == IPV4_IN_IP || protocol == IPV6_IN_IP || protocol == GRE;
+}
 
 /* A datagram is as long as its UDP header says, if that many bytes were captured: some sensors
    announce a wrong IP length, and Ethernet pads short frames. */
@@ -136,15 +150,18 @@ static int read_ipv4(const uint8_t *data, int64_t at, int64_t stop, Packet *pack
         return TRUNCATED;
     const uint8_t *header = data + at;
     const int64_t body = at + (header[0] & 15) * 4, place = high2(header + 6);
+    const int is_part = (place & (MORE_FRAGMENTS | FRAGMENT_OFFSET)) != 0;
     if (header[0] >> 4 != 4 || body < at + IPV4_BYTES)
         return NOT_IP;
+    if (is_tunnel(header[9]) && !is_part && body < stop)
+        return read_odd(body, header[9], packet);
     if (header[9] != UDP)
         return NOT_UDP;
     packet->key[0] = UINT64_C(4) << 32;
     packet->key[1] = packet->key[3] = 0;
     packet->key[2] = (uint64_t)high(header + 12);
     packet->key[4] = (uint64_t)high(header + 16);
-    if (!(place & (MORE_FRAGMENTS | FRAGMENT_OFFSET)))
+    if (!is_part)
         return read_udp(data, body, stop, packet);
     packet->key[0] |= (uint64_t)high2(header + 4);
     packet->offset = (place & FRAGMENT_OFFSET) * 8;
@@ -183,6 +200,8 @@ static int read_ipv6(const uint8_t *data, int64_t at, int64_t stop, Packet *pack
         }
         const int is_plain = kind == HOP_BY_HOP || kind == ROUTING || kind == DESTINATION
             || kind == MOBILITY || kind == HOST_IDENTITY || kind == SHIM6;
+        if (is_tunnel(kind) && at < stop)
+            return read_odd(at, kind, packet);
         if (!is_plain && kind != AUTHENTICATION)
             return NOT_UDP;
         if (at + 2 > stop)
@@ -211,6 +230,8 @@ static int read_typed(const uint8_t *data, int64_t type_at, int64_t at, int64_t 
     }
     if (type == IPV4_TYPE)
         return read_ipv4(data, at, stop, packet);
+    if ((type == PPPOE_TYPE || type == MPLS_TYPE || type == MPLS_TYPE + 1) && at < stop)
+        return read_odd(at, type, packet);
     return type == IPV6_TYPE ? read_ipv6(data, at, stop, packet) : NOT_IP;
 }
 
@@ -259,6 +280,10 @@ static int read_frame(const uint8_t *data, int64_t at, int64_t stop, int64_t lin
     case 228:
     case 229:
         return read_ip(data, at, stop, packet);
+    case 9: /* PPP */
+    case 50:
+    case 51: /* PPP over Ethernet */
+        return at < stop ? read_odd(at, -link, packet) : TRUNCATED;
     default:
         return NOT_IP;
     }
@@ -447,14 +472,21 @@ static void add_fragment(Dissection *all, uint8_t *data, const Packet *packet, i
         complete(all, data, number, host_ns);
 }
 
-/* Find the datagrams of frames (first byte, captured and original length, link type, receive
-   time). There is room for `frames` further datagrams and parts, and in the front of `data` for
-   those that are joined. */
-EXPORT void mlbatch_dissect(Dissection *all, uint8_t *data, int64_t frames, const int64_t *start,
-                            const int64_t *captured, const int64_t *original, const int64_t *link,
-                            const int64_t *host_ns)
+/* Find the datagrams of frames from `first` on (first byte, captured and original length, link
+   type, receive time). There is room for so many further datagrams and parts, and in the front of
+   `data` for those that are joined. Return the number of the next frame: one that is odd, or
+   `frames`. */
+EXPORT int64_t mlbatch_dissect(Dissection *all, uint8_t *data, int64_t first, int64_t frames,
+                               const int64_t *start, const int64_t *captured,
+                               const int64_t *original, const int64_t *link,
+                               const int64_t *host_ns)
 {
-    for (int64_t frame = 0; frame < frames; frame++) {
+    for (int64_t frame = first; frame < frames; frame++) {
+        if (frame + FRAMES_AHEAD < frames) {
+            const uint8_t *ahead = data + start[frame + FRAMES_AHEAD];
+            prefetch(ahead);
+            prefetch(ahead + LINE - 1);
+        }
         const int64_t stop = start[frame] + captured[frame];
         Packet packet;
         int verdict = read_frame(data, start[frame], stop, link[frame], &packet);
@@ -464,9 +496,15 @@ EXPORT void mlbatch_dissect(Dissection *all, uint8_t *data, int64_t frames, cons
             deliver(all, data, packet.key, packet.start, host_ns[frame]);
         else if (verdict == PART)
             add_fragment(all, data, &packet, frame, host_ns[frame]);
-        else
+        else if (verdict != ODD)
             all->skipped[verdict]++;
+        else {
+            all->odd_at = packet.start;
+            all->odd_kind = packet.kind;
+            return frame;
+        }
     }
+    return frames;
 }
 
 /* Copy the parts that are in `data`, or all, to `kept` from byte `used` on; return the first free
@@ -533,7 +571,6 @@ static uint64_t sum_words(const uint8_t *from, int64_t bytes)
 EXPORT void mlbatch_sums(int64_t packets, const uint8_t *data, const int64_t *start, int64_t bytes,
                          uint64_t *sums)
 {
-    enum { LINE = 64 };
     for (int64_t packet = 0; packet < packets; packet++) {
         const uint8_t *from = data + start[packet];
         /* Packets of other sensors are in between: no processor expects the next one. */

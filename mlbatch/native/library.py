@@ -29,7 +29,7 @@ _FUNCTIONS: dict[str, tuple[type[Any], ...]] = {
     "mlbatch_paced": (_ADDRESS, _ADDRESS, _WORD, *[_ADDRESS] * 5),
     "mlbatch_single": (_ADDRESS, _WORD, _ADDRESS, *[_WORD] * 3, *[_ADDRESS] * 3),
     "mlbatch_walk": (_ADDRESS, *[_WORD] * 6, _ADDRESS, _ADDRESS),
-    "mlbatch_dissect": (_ADDRESS, _ADDRESS, _WORD, *[_ADDRESS] * 5),
+    "mlbatch_dissect": (_ADDRESS, _ADDRESS, _WORD, _WORD, *[_ADDRESS] * 5),
     "mlbatch_keep": (_ADDRESS, _ADDRESS, _WORD, _ADDRESS, _WORD),
     "mlbatch_copy": (_WORD, *[_ADDRESS] * 5),
     "mlbatch_gather": (_WORD, _ADDRESS, _ADDRESS, _WORD, _ADDRESS, _WORD, _ADDRESS),
@@ -57,7 +57,6 @@ _FUNCTIONS: dict[str, tuple[type[Any], ...]] = {
 }
 _WITHOUT_RESULT = (
     "mlbatch_pack",
-    "mlbatch_dissect",
     "mlbatch_copy",
     "mlbatch_gather",
     "mlbatch_sums",
@@ -308,6 +307,8 @@ class Dissection(ctypes.Structure):
         ("most_first", _WORD),
         ("first_count", _WORD),
         ("first_keys", _ADDRESS),
+        ("odd_at", _WORD),
+        ("odd_kind", _WORD),
         ("settled", _ADDRESS),
     ]
 

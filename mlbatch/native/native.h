@@ -373,6 +373,8 @@ typedef struct {
     int64_t most_first;
     int64_t first_count;
     uint64_t *first_keys; /* (most_first, KEY_WORDS): of the sets that were open first */
+    int64_t odd_at;       /* first byte behind the headers of an odd frame */
+    int64_t odd_kind;     /* `capture.c`, Packet */
     int64_t *settled;     /* of inherited sets: a reason, -1: open */
 } Dissection;
 
@@ -418,9 +420,10 @@ EXPORT int64_t mlbatch_single(const uint8_t *data, int64_t packets, const int64_
 EXPORT int64_t mlbatch_walk(const uint8_t *data, int64_t begin, int64_t end, int64_t is_swapped,
                             int64_t unit_ns, int64_t most_bytes, int64_t room, int64_t *columns,
                             int64_t *stop);
-EXPORT void mlbatch_dissect(Dissection *all, uint8_t *data, int64_t frames, const int64_t *start,
-                            const int64_t *captured, const int64_t *original, const int64_t *link,
-                            const int64_t *host_ns);
+EXPORT int64_t mlbatch_dissect(Dissection *all, uint8_t *data, int64_t first, int64_t frames,
+                               const int64_t *start, const int64_t *captured,
+                               const int64_t *original, const int64_t *link,
+                               const int64_t *host_ns);
 EXPORT int64_t mlbatch_keep(Dissection *all, const uint8_t *data, int64_t copies_all, uint8_t *kept,
                             int64_t used);
 EXPORT void mlbatch_copy(int64_t runs, const uint8_t *source, const int64_t *source_at,

@@ -59,6 +59,7 @@ NEEDLESS = (
     *("mlbatch.pipeline.deskew", "mlbatch.motion.se3", "mlbatch.pipeline.shard_part"),
     *("mlbatch.batching.fusion", "mlbatch.batching.sweeps", "mlbatch.pipeline.shards"),
     *("numpy.ma", "rosbags", "rich", "mcap.writer", "importlib.metadata"),
+    *("mlbatch.readers.capture.odd", "dpkt"),
 )
 
 

@@ -58,7 +58,7 @@ from tests.decode.test_engine import (
 from tests.fuzz.harness import BrokenLaw, Target
 from tests.fuzz.mutation import Seeds, mutated
 from tests.fuzz.readers import capture_records
-from tests.reference.capture import Frame, dissect
+from tests.reference.capture import ODD, Frame, dissect
 
 if not trouble():
     from mlbatch.ros.native_points import pack_compiled, take_rows_compiled
@@ -227,6 +227,8 @@ def _dissect(data: bytes, folder: Path) -> None:
     ]
     columns = (host_ns.tolist(), link.tolist(), pieces, original.tolist())
     expected, skipped = dissect(Frame(*row) for row in zip(*columns, strict=True))
+    if ODD in skipped:
+        return
     if (found, counts.skipped) != (expected, skipped):
         raise BrokenLaw("compiled loops find other datagrams than the literal dissector")
 

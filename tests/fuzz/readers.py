@@ -35,7 +35,7 @@ from tests.builders.rosbag2 import Form, write_folder, write_rosbag2
 from tests.builders.traffic import frames
 from tests.fuzz.harness import BrokenLaw, Target
 from tests.fuzz.mutation import Seeds, mutated, mutated_text
-from tests.reference.capture import dissect, pcap_frames
+from tests.reference.capture import ODD, dissect, pcap_frames
 
 # Enough for fragments of both lidars and for packets of every kind.
 _RECORDS = 40
@@ -99,7 +99,10 @@ def _literally(data: bytes, folder: Path) -> None:
             (int(at_ns), str(streams.streams[stream]), batch.data[at : at + size].tobytes())
             for at, size, stream, at_ns in rows
         ]
-    if (found, recording.counts.skipped) != dissect(pcap_frames(data)):
+    expected, skipped = dissect(pcap_frames(data))
+    if ODD in skipped:
+        return
+    if (found, recording.counts.skipped) != (expected, skipped):
         raise BrokenLaw("other packets than the literal dissector finds")
 
 

@@ -70,9 +70,16 @@ class Found(NamedTuple):
 def content(frame: Frame) -> Datagram | Piece | str:
     """What a frame contains, or why nothing."""
     found = _at_link(frame.data, frame.link)
-    if isinstance(found, str) or len(frame.data) >= frame.original:
-        return found
-    return "truncated"
+    if len(frame.data) < frame.original and found not in ("not_ip", "not_udp"):
+        return "truncated"
+    return found
+
+
+# What an IP packet may be in: of these frames only the literal bytes in tests say more.
+ODD = "odd"
+ODD_LINKS = (9, 50, 51)
+ODD_TYPES = (0x8847, 0x8848, 0x8864)
+TUNNELS = (4, 41, 47)
 
 
 def _at_link(data: bytes, link: int) -> Datagram | Piece | str:
@@ -89,6 +96,8 @@ def _at_link(data: bytes, link: int) -> Datagram | Piece | str:
                 return "truncated"
             ethertype = int.from_bytes(rest[2:4], "big")
             rest = rest[4:]
+        if ethertype in ODD_TYPES and rest:
+            return ODD
         version = VERSIONS.get(ethertype)
     elif link in FAMILY_LINKS:
         if len(data) < 4:
@@ -102,6 +111,8 @@ def _at_link(data: bytes, link: int) -> Datagram | Piece | str:
         if not data:
             return "truncated"
         version, rest = data[0] >> 4, data
+    elif link in ODD_LINKS:
+        return ODD if data else "truncated"
     else:
         return "not_ip"
     if version == 4:
@@ -118,10 +129,12 @@ def _ipv4(data: bytes) -> Datagram | Piece | str:
     header = (first & 15) * 4
     if first >> 4 != 4 or header < 20:
         return "not_ip"
+    offset, more = (place & 0x1FFF) * 8, bool(place & 0x2000)
+    if protocol in TUNNELS and not offset and not more and len(data) > header:
+        return ODD
     if protocol != UDP:
         return "not_udp"
     names = (str(ipaddress.IPv4Address(source)), str(ipaddress.IPv4Address(target)))
-    offset, more = (place & 0x1FFF) * 8, bool(place & 0x2000)
     if not offset and not more:
         return _udp(names[0], data[header:])
     if length <= header or length > len(data):
@@ -153,6 +166,8 @@ def _ipv6(data: bytes) -> Datagram | Piece | str:
             if 40 + length <= at or 40 + length > len(data):
                 return "truncated"
             return Piece((*names, ident), data[at : 40 + length], offset, more)
+        if kind in TUNNELS and len(data) > at:
+            return ODD
         if kind not in (*PLAIN_HEADERS, AUTHENTICATION):
             return "not_udp"
         if len(data) < at + 2:

@@ -31,7 +31,7 @@ import numpy as np
 
 from mlbatch.arrays import I64Array, U8Array
 from mlbatch.native.library import Dissection, address, library
-from mlbatch.readers.capture.frames import Frames
+from mlbatch.readers.capture.frames import RAW_IP, Frames
 from mlbatch.types import MOST_STREAMS, OTHER_STREAMS, CaptureCounts, Stream, StreamTable
 from mlbatch.units import NS_PER_S
 
@@ -146,6 +146,7 @@ class Dissector:
 
         Fragments are joined where they are, or from byte 0 of `data` on. The caller leaves room
         there: the bytes of the frames and `held_bytes`, or MAX_DATAGRAM_BYTES for each frame.
+        Odd frames in `frames` become the IP packets in them.
         """
         count = len(frames)
         self._span(frames.host_ns)
@@ -163,9 +164,19 @@ class Dissector:
         state.room = count
         state.datagrams = address(found)
         state.datagram_count = state.front = 0
-        self._library.mlbatch_dissect(
-            ctypes.addressof(state), address(data), count, *map(address, columns)
-        )
+        frame = depth = 0
+        opened = -1
+        while True:
+            frame = self._library.mlbatch_dissect(
+                ctypes.addressof(state), address(data), frame, count, *map(address, columns)
+            )
+            if frame == count:
+                break
+            # A packet in a packet is odd again.
+            depth = depth + 1 if frame == opened else 1
+            opened = frame
+            if not self._open_odd(data, columns, frame, depth):
+                frame += 1
         if state.loose_bytes:
             self._keep(data)
         self.counts.frames += count
@@ -232,6 +243,27 @@ class Dissector:
         if len(host_ns) and self.begin_ns is None:
             self.begin_ns = int(host_ns[0])
         self.end_ns = int(host_ns.max(initial=self.end_ns))
+
+    def _open_odd(self, data: U8Array, columns: list[I64Array], frame: int, depth: int) -> bool:
+        """Replace a frame by the IP packet in it, or count it; whether there is one."""
+        from mlbatch.readers.capture.odd import MAX_DEPTH, MAX_HEADER_BYTES, find_ip
+
+        start, captured, original, link, _ = columns
+        kind = self._state.odd_kind
+        odd_at = self._state.odd_at
+        stop = int(start[frame] + captured[frame])
+        headers = data[odd_at : min(stop, odd_at + MAX_HEADER_BYTES)].tobytes()
+        place = find_ip(headers, kind) if depth <= MAX_DEPTH else None
+        if place is None:
+            is_in_ip = 0 <= kind < 256
+            self._skipped[_REASONS.index("not_udp" if is_in_ip else "not_ip")] += 1
+            return False
+        passed = odd_at + place - start[frame]
+        start[frame] += passed
+        captured[frame] -= passed
+        original[frame] -= passed
+        link[frame] = RAW_IP
+        return True
 
     def _room_for_parts(self, count: int) -> None:
         if count > len(self._parts):

@@ -1,6 +1,6 @@
 """Frames of captures, as a file format finds them, and the link types that are read.
 
-Numbers of link types: tcpdump.org/linktypes.html; their headers: `native/capture.c`.
+Numbers of link types: tcpdump.org/linktypes.html; their headers: `native/capture.c`, `odd.py`.
 """
 
 from __future__ import annotations
@@ -11,12 +11,12 @@ import numpy as np
 
 from mlbatch.arrays import I64Array
 
-LINKS = frozenset((0, 1, 12, 14, 101, 108, 113, 228, 229, 276))
+RAW_IP = 101
+LINKS = frozenset((0, 1, 9, 12, 14, 50, 51, RAW_IP, 108, 113, 228, 229, 276))
 # Frames of a pcapng interface that the file does not describe.
 NO_LINK = -1
 _NAMES = {
     NO_LINK: "no interface block",
-    9: "PPP",
     105: "IEEE 802.11",
     127: "IEEE 802.11 radiotap",
     189: "USB",
