@@ -27,6 +27,10 @@ SENSOR_FROM_BODY = "sensor_from_body"
 M = "m"
 MM = "mm"
 _MM_PER_M = 1000.0
+# Lever arms of matrices in millimetres, at least: no origins of two devices are nearer. Parts of
+# one device may be, where they are parallel.
+_LEAST_M = 0.005
+_LEAST_TURNED_M = 0.01
 # Autoware: `velodyne_top_base_link` is the mounting face; points are in `velodyne_top`.
 _HOUSING = "_base_link"
 _POSE_KEYS = ("x", "y", "z", "roll", "pitch", "yaw")
@@ -313,6 +317,16 @@ def _product(roots: Sequence[Node], keys: Sequence[str], rig: Node, unit: str) -
             product = compose(product, rigid(matrix))
         except RigError as err:
             raise node.error_here(str(err)) from err
+    arm_m = float(np.linalg.norm(product[:3, 3]))
+    least_m = _LEAST_M if np.allclose(product[:3, :3], np.eye(3)) else _LEAST_TURNED_M
+    if unit == MM and 0 < arm_m < least_m:
+        raise node.error(
+            f"translations in millimetres, of {least_m * _MM_PER_M:g} mm or more between body and "
+            "sensor",
+            f"{arm_m * _MM_PER_M:.4g} mm, {arm_m * _MM_PER_M:.4g} m if the file has metres",
+            f"write `matrix_unit: m` next to `key` ({rig.place}), or give such a pose as "
+            "translation_m with a rotation",
+        )
     return product
 
 

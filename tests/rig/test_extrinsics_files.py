@@ -262,6 +262,47 @@ def test_millimetres_are_refused_unless_stated(folder: Path) -> None:
     assert _pose(folder, (text % "").replace("key: T", "key: far"))[0, 3] == 12.0
 
 
+QUARTER = "0, -1, 0, {}, 1, 0, 0, {}, 0, 0, 1, {}, 0, 0, 0, 1"
+PARALLEL = "1, 0, 0, {}, 0, 1, 0, {}, 0, 0, 1, {}, 0, 0, 0, 1"
+
+
+@pytest.mark.parametrize(
+    ("form", "translation", "is_refused"),
+    [
+        (QUARTER, (1.2, -0.9, 2.0), True),  # m: 2.5
+        (QUARTER, (5.0, 6.0, 0.0), True),  # m: 7.81, as on a truck; mm: too near for two devices
+        (PARALLEL, (0.0, 0.0, 1.5), True),
+        (PARALLEL, (6.253, -11.775, 7.645), False),  # the IMU of an Ouster, mm
+        (PARALLEL, (0.0, 4.0, 4.0), False),
+        (QUARTER, (8.0, 8.0, 0.0), False),
+        (QUARTER, (0.0, 0.0, 0.0), False),  # a rotation alone has no unit
+    ],
+)
+def test_metres_stated_as_millimetres_are_refused(
+    folder: Path, form: str, translation: tuple[float, ...], is_refused: bool
+) -> None:
+    values = form.format(*translation)
+    (folder / "m.yaml").write_text(
+        f"%YAML:1.0\n---\nT: !!opencv-matrix\n   rows: 4\n   cols: 4\n   data: [{values}]\n"
+    )
+    text = "{file: m.yaml, key: T, direction: sensor_from_body, matrix_unit: mm}"
+    if not is_refused:
+        np.testing.assert_allclose(
+            np.linalg.norm(_pose(folder, text)[:3, 3]), np.linalg.norm(translation) / 1000
+        )
+        return
+    with pytest.raises(RigError) as caught:
+        _pose(folder, text)
+    size = f"{np.linalg.norm(translation):.4g}"
+    least = "5" if form is PARALLEL else "10"
+    assert str(caught.value) == (
+        f"{folder / 'm.yaml'}:3: T: expected translations in millimetres, of {least} mm or more "
+        f"between body and sensor, found {size} mm, {size} m if the file has metres; write "
+        f"`matrix_unit: m` next to `key` ({folder / 'rig.yaml'}:3: {X}), or give such a pose as "
+        "translation_m with a rotation"
+    )
+
+
 X = "sensors[0].extrinsics"
 MISTAKES = [
     ("{file: none.yaml}", ".file: expected an existing file, found none at"),
