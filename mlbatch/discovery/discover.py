@@ -24,6 +24,7 @@ from mlbatch.discovery.match import (
     Matched,
     describe,
     is_model,
+    lidars_on,
     match,
     match_rig,
     senders,
@@ -252,9 +253,18 @@ def refuse_untimed(table: StreamTable, sensor: DetectedSensor, option: str) -> N
         )
 
 
-def refuse_absent(sensor: DetectedSensor, rig: Path | None) -> NoReturn:
+def refuse_absent(setup: Discovery, sensor: DetectedSensor, rig: Path | None) -> NoReturn:
     """Raise RigError for a required sensor of the rig that sent no packet."""
     lidar = sensor.lidar
+    owned = {kind for one in setup.sensors for kind in one.kinds}
+    unknown = [kind for kind in setup.sampler.kinds if kind not in owned]
+    others = lidars_on(setup.sampler, sensor.selector, unknown)
+    if others and lidar.carries_serial:
+        raise RigError(
+            f"{rig}: sensor {sensor.name}: expected packets of serial number {lidar.serial}, that "
+            f"of its metadata {lidar.calibration}, found none, but those of {others}; give the "
+            "metadata of the lidar that was recorded, correct its stream, or set `optional: true`"
+        )
     selector = None if sensor.rig is None else sensor.rig.stream
     source = f"from {selector}" if selector else f"of a {lidar.model} ({lidar.calibration})"
     raise RigError(

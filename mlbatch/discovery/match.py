@@ -476,7 +476,7 @@ def _silent(
     """A sensor of the rig that sent no packet; used: calibrations of those that did."""
     start = f"{origin}: sensor {expected.name}:"
     lidar: Lidar | None = None
-    others = _lidars_on(sampler, expected.selector, unknown)
+    others = lidars_on(sampler, expected.selector, unknown)
     own = _own_calibrations(expected, used)
     if len(own) == 1:
         try:
@@ -533,7 +533,7 @@ def _own_calibrations(expected: ExpectedSensor, used: Collection[str]) -> list[C
     return [one for one in named if one.path is not None] or named or own
 
 
-def _lidars_on(sampler: Sampler, selector: StreamSelector, kinds: Sequence[PacketKind]) -> str:
+def lidars_on(sampler: Sampler, selector: StreamSelector, kinds: Sequence[PacketKind]) -> str:
     """Descriptions of the lidars among the kinds that a selector selects, or ""."""
     found = []
     for kind in kinds:

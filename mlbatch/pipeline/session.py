@@ -278,7 +278,7 @@ class Session:
         """Raise RigError if a sensor that the rig requires sent no packet."""
         for sensor in self.sensors:
             if sensor.is_required and not sensor.ledger.packets.read:
-                refuse_absent(sensor.detected, self.job.selection.rig)
+                refuse_absent(self.setup, sensor.detected, self.job.selection.rig)
 
     def refuse_apart(self) -> None:
         """Raise RecordingError if recordings do not overlap; a warning for optional sensors."""

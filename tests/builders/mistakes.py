@@ -319,6 +319,14 @@ MISTAKES: dict[str, tuple[str, int, str]] = {
         "fix/silent.yaml: sensor rear: expected its packets, found none from source_ip 10.5.5.99; "
         "correct its stream or serial, or set `optional: true`",
     ),
+    "rig with the metadata of another unit": (
+        "pair/drive.pcap --rig serials.yaml",
+        1,
+        "serials.yaml: sensor right: expected packets of serial number 333, that of its metadata "
+        "other/333.json, found none, but those of Ouster lidar, serial 222, 1280 bytes: needs its "
+        "metadata (10.0.0.2 > port 7502); give the metadata of the lidar that was recorded, "
+        "correct its stream, or set `optional: true`",
+    ),
     "rig sensor without metadata": (
         "bare/drive.pcap --rig serial.yaml",
         1,

@@ -74,6 +74,14 @@ def _write_sessions(folder: Path) -> None:
     _write_other_modes(folder)
     write_session(folder / "uptime", UPTIME)
     write_session(folder / "pair", one, twin(one, 222))
+    (folder / "other").mkdir()
+    write_metadata(folder / "other" / "333.json", replace(SMALL, serial=333))
+    (folder / "serials.yaml").write_text(
+        "sensors:\n"
+        "- {name: left, metadata: pair/111.json, extrinsics: {translation_m: [0, 1, 0]}}\n"
+        "- {name: right, metadata: other/333.json, extrinsics: {translation_m: [0, 0, 0]}, "
+        "stream: {port: 7502}}\n"
+    )
     behind = replace(twin(one, 222), begin_ns=one.begin_ns - 3600 * NS_PER_S)
     late = replace(twin(one, 222), begin_ns=one.begin_ns + 9 * NS_PER_S)
     write_session(folder / "apart", one, replace(behind, host_ns=one.host_ns + 3600 * NS_PER_S))
