@@ -13,6 +13,7 @@ import numpy as np
 from mlbatch.discovery.router import Role, Router
 from mlbatch.discovery.sampler import Sampler
 from mlbatch.discovery.types import DetectedSensor, Note
+from mlbatch.motion.gravity import MOST_TILT_DEG, mean_gravity, tilt_deg
 from mlbatch.types import ImuSamples
 
 # Upward, by the end of the name of the body frame: of aircraft and ships, and of cameras.
@@ -33,9 +34,6 @@ def gravity_notes(
         parts = list(_samples(sampler, router, number, sensor))
         if sensor_from_imu is None or not parts:
             continue
-        # Few sessions have both.
-        from mlbatch.motion.imu import MOST_TILT_DEG, mean_gravity, tilt_deg
-
         gravity = mean_gravity(parts)
         if gravity is None:
             continue

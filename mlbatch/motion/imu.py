@@ -8,7 +8,6 @@ errors of the accelerometer; within a window only its product with 0.1 s matters
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,21 +15,21 @@ import numpy as np
 from mlbatch.arrays import F64Array, I64Array
 from mlbatch.errors import RecordingError
 from mlbatch.frames.transforms import inverse
+from mlbatch.motion.gravity import (
+    GRAVITY_TOLERANCE,
+    LEAST_SAMPLES,
+    MOST_BIAS,
+    MOST_TILT_DEG,
+    STANDSTILL_NS,
+    tilt_deg,
+)
 from mlbatch.motion.se3 import exp_rotation, rotated
 from mlbatch.motion.track import MAX_GAP_NS, PoseTrack
-from mlbatch.types import ImuSamples
 from mlbatch.units import NS_PER_MS, NS_PER_S, STANDARD_GRAVITY
 
-STANDSTILL_NS = NS_PER_S
-_LEAST_SAMPLES = 20
 # Largest standard deviation at a standstill: engines run, hands shake.
 _MOST_RATE = 0.05
 _MOST_FORCE = 0.5
-# Largest mean rate, rad/s: more than the bias of small gyroscopes (5 degrees/s), so a turn.
-_MOST_BIAS = 0.2
-_GRAVITY_TOLERANCE = 0.05
-# Of the body's z axis from the vertical at rest: no vehicle stands on a steeper slope.
-MOST_TILT_DEG = 30.0
 # Without samples for longer, velocity and attitude are not known any more.
 _MOST_GAP_PERIODS = 3
 _LEAST_GAP_NS = 20 * NS_PER_MS
@@ -54,9 +53,9 @@ def standstill(stamp_ns: I64Array, force: F64Array, rate: F64Array, name: str) -
     stamp_ns: (n,); force, rate: (n, 3), m/s2 and rad/s; name: of the IMU, for errors.
     """
     rows = stamp_ns - stamp_ns[0] <= STANDSTILL_NS if len(stamp_ns) else np.zeros(0, np.bool_)
-    if int(rows.sum()) < _LEAST_SAMPLES or stamp_ns[-1] - stamp_ns[0] < STANDSTILL_NS:
+    if int(rows.sum()) < LEAST_SAMPLES or stamp_ns[-1] - stamp_ns[0] < STANDSTILL_NS:
         raise RecordingError(
-            f"{name}: expected {_LEAST_SAMPLES} samples in the first second, found "
+            f"{name}: expected {LEAST_SAMPLES} samples in the first second, found "
             f"{int(rows.sum())}; use another source of poses"
         )
     spread_rate = float(rate[rows].std(axis=0).max())
@@ -69,37 +68,19 @@ def standstill(stamp_ns: I64Array, force: F64Array, rate: F64Array, name: str) -
         )
     bias = rate[rows].mean(axis=0)
     turn = float(np.sqrt((bias**2).sum()))
-    if turn > _MOST_BIAS:
+    if turn > MOST_BIAS:
         raise RecordingError(
             f"{name}: expected the rig to stand in the first second, found a mean of {turn:.3g} "
             "rad/s; begin the recording at rest, or use another source of poses"
         )
     gravity = force[rows].mean(axis=0)
     size = float(np.sqrt((gravity**2).sum()))
-    if abs(size / STANDARD_GRAVITY - 1.0) > _GRAVITY_TOLERANCE:
+    if abs(size / STANDARD_GRAVITY - 1.0) > GRAVITY_TOLERANCE:
         raise RecordingError(
             f"{name}: expected {STANDARD_GRAVITY:.2f} m/s2 at rest, found {size:.3f}; check the "
             "units of the IMU"
         )
     return Standstill(bias, gravity, int(np.median(np.diff(stamp_ns[rows]))))
-
-
-def mean_gravity(parts: Sequence[ImuSamples]) -> F64Array | None:
-    """Mean specific force (3,), m/s2, IMU frame, of samples; None if that is not gravity alone."""
-    stamp_ns = np.concatenate([part.stamp_ns for part in parts])
-    if len(stamp_ns) < _LEAST_SAMPLES or np.ptp(stamp_ns) < STANDSTILL_NS:
-        return None
-    force: F64Array = np.concatenate([part.acceleration for part in parts]).mean(axis=0)
-    rate = np.concatenate([part.angular_velocity for part in parts]).mean(axis=0)
-    off = abs(float(np.linalg.norm(force)) / STANDARD_GRAVITY - 1.0)
-    turns = float(np.linalg.norm(rate)) > _MOST_BIAS
-    return None if off > _GRAVITY_TOLERANCE or turns else force
-
-
-def tilt_deg(up: F64Array, vertical: F64Array) -> float:
-    """Angle between two vectors (3,); rounded, so that a slope of 30 degrees is not one more."""
-    across = float(np.linalg.norm(np.cross(vertical, up)))
-    return round(math.degrees(math.atan2(across, float(vertical @ up))), 6)
 
 
 def check_upright(up: F64Array, name: str) -> None:

@@ -20,7 +20,8 @@ from mlbatch.batching.windows import Window
 from mlbatch.clocks.timescale import format_difference
 from mlbatch.errors import ClockError, RigError
 from mlbatch.lidar.limits import FAR_POSE_M
-from mlbatch.motion.imu import STANDSTILL_NS, Integrator
+from mlbatch.motion.gravity import STANDSTILL_NS
+from mlbatch.motion.imu import Integrator
 from mlbatch.motion.moves import PoseLine
 from mlbatch.motion.track import PoseTrack
 from mlbatch.motion.tum import read_tum
