@@ -23,6 +23,7 @@ import sys
 import tempfile
 import threading
 import time
+import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -30,7 +31,7 @@ from types import FrameType
 from typing import Any, NoReturn
 
 from mlbatch.cli import main as mlbatch
-from mlbatch.pipeline import resume
+from mlbatch.pipeline.run import _Output
 from tests.builders.bags import Body, Recorded, imu_message, packet_message
 from tests.builders.captures import write_pcap
 from tests.builders.ouster import OusterSpec
@@ -158,14 +159,14 @@ class End:
     signal: signal.Signals = signal.SIGKILL
 
 
-def run(folder: Path, words: list[str], end: End, interval_s: float) -> int:
+def run(folder: Path, words: list[str], end: End) -> int:
     """Convert in a process of its own; gives its exit code, negative when a signal ended it.
 
     With `at_call` 0 all calls are counted: the number is left in the file `calls`.
     """
     child = os.fork()
     if not child:
-        _convert(folder, words, end, interval_s)
+        _convert(folder, words, end)
     # One that hangs shows where.
     timers = [threading.Timer(HANG_S, _kill, (child, signal.SIGABRT))]
     if end.after_s is not None:
@@ -185,13 +186,12 @@ def _kill(child: int, number: signal.Signals) -> None:
         os.kill(child, number)
 
 
-def _convert(folder: Path, words: list[str], end: End, interval_s: float) -> NoReturn:
+def _convert(folder: Path, words: list[str], end: End) -> NoReturn:
     os.chdir(folder)
     with open("said", "a") as said:
         os.dup2(said.fileno(), 1)
         os.dup2(said.fileno(), 2)
     faulthandler.enable(2)
-    resume.INTERVAL_S = interval_s
     sys.argv = ["mlbatch", *words]
     calls = 0
     begun = False
@@ -206,19 +206,19 @@ def _convert(folder: Path, words: list[str], end: End, interval_s: float) -> NoR
             if calls == end.at_call:
                 os.kill(os.getpid(), end.signal)
 
-    begin = resume.ResumeLog.begin
+    begin = _Output._begin
 
-    def begin_and_count(course: resume.ResumeLog) -> None:
+    def begin_and_count(output: _Output) -> None:
         nonlocal begun
         begun = True
-        begin(course)
+        begin(output)
 
     if end.at_call is not None:
         # Files are written by threads that are there when the output begins.
         sys.setprofile(count)
         threading.setprofile(count)
         # What comes before, random times strike.
-        setattr(resume.ResumeLog, "begin", begin_and_count)  # noqa: B010 - no type allows it
+        setattr(_Output, "_begin", begin_and_count)  # noqa: B010 - no type allows it
     code = OUTSIDE
     try:
         code = RAISED
@@ -250,9 +250,17 @@ def contents(folder: Path) -> dict[str, object]:
             for key in ("timing", "command"):
                 del account["report"][key]
             found[name] = account
+        elif path.name == "files.jsonl":
+            found[name] = valid_lines(path)
         else:
             found[name] = path.read_bytes()
     return found
+
+
+def valid_lines(path: Path) -> set[bytes]:
+    """The lines of `files.jsonl` that count, in no order: one that is cut off does not."""
+    lines = path.read_bytes().splitlines()
+    return {line for line in lines if line[:8] == b"%08x" % zlib.crc32(line[9:])}
 
 
 class Storm:
@@ -281,7 +289,7 @@ class Storm:
                 return fault
             if number:
                 self._tear(place)
-        code = run(place, [*self._words(name), "--resume"], End(), 0.0)
+        code = run(place, [*self._words(name), "--resume"], End())
         said = (place / "said").read_text()
         self.resumed += "resumed after" in said
         if code:
@@ -299,12 +307,12 @@ class Storm:
         place = self._folder / "whole"
         place.mkdir()
         began_s = time.perf_counter()
-        code = run(place, self._words(name), End(), 0.5)
+        code = run(place, self._words(name), End())
         wall_s = time.perf_counter() - began_s
         if code:
             raise SystemExit(f"{name}: exit code {code}: {(place / 'said').read_text()}")
         whole = contents(place)
-        run(place, [*self._words(name), "--overwrite"], End(at_call=0), 0.0)
+        run(place, [*self._words(name), "--overwrite"], End(at_call=0))
         calls = int((place / "calls").read_text())
         shutil.rmtree(place)
         self._whole[name] = whole, calls, wall_s
@@ -323,7 +331,7 @@ class Storm:
             at_call = max(1, calls - int(40 * chance) if late else int(calls * chance))
             end = End(at_call=at_call, signal=number)
         before = (place / "said").stat().st_size if (place / "said").exists() else 0
-        code = run(place, words, end, self._chance.choice((0.0, 0.0, 0.02)))
+        code = run(place, words, end)
         said = (place / "said").read_text()[before:]
         ended = {-number, INTERRUPTED} - ({INTERRUPTED} if number == signal.SIGKILL else set())
         self.kills[number] += code in ended
@@ -335,13 +343,13 @@ class Storm:
         return ""
 
     def _tear(self, place: Path) -> None:
-        """Cut off the end of a state file, as if its last line had not been written whole."""
-        for state in place.glob("*.state"):
-            size = state.stat().st_size
-            text = state.read_bytes()
+        """Cut off the end of files.jsonl, as if its last line had not been written whole."""
+        for path in place.glob("*.partial/files.jsonl"):
+            size = path.stat().st_size
+            text = path.read_bytes()
             last = size - text.rfind(b"\n", 0, -1)
             if self._chance.random() < 0.3:
-                os.truncate(state, size - self._chance.randrange(max(1, last)))
+                os.truncate(path, size - self._chance.randrange(max(1, last)))
 
     def _differences(self, found: dict[str, object], wanted: dict[str, object]) -> str:
         names = sorted(found.keys() ^ wanted.keys())

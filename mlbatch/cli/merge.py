@@ -36,8 +36,8 @@ def merge(
     from mlbatch.cli.summary import exit_beyond, print_summary, say
     from mlbatch.errors import one_line
     from mlbatch.pipeline.interrupts import interruptible
-    from mlbatch.pipeline.shard_merge import merge as merge_parts
-    from mlbatch.pipeline.shard_merge import read_parts
+    from mlbatch.pipeline.merge import merge as merge_parts
+    from mlbatch.pipeline.merge import read_parts
     from mlbatch.report.limits import exceeded, parse_limits
     from mlbatch.report.report import build_report
 

@@ -35,27 +35,32 @@ from mlbatch.report.limits import Limit, exceeded
 from mlbatch.report.report import RunReport, build_report, report_text
 from mlbatch.types import RunInfo
 from mlbatch.writers import (
+    FILES_JSONL,
     SHARD_JSON,
+    FilesWriter,
     ScanWriter,
     WriterOptions,
     check_options,
     check_target,
     check_variants,
     choose_format,
+    discard,
+    export_errors,
     extras,
     jobs_for,
     open_writer,
-    plugin,
+    partial_path,
     record_layout,
     report_paths,
     sync_entries,
+    tidy,
     write_text,
 )
 
-# `--resume` and `--shard` are loaded where they are needed: a dry run needs neither.
+# Loaded where it is needed: a dry run has no files.
 if TYPE_CHECKING:
-    from mlbatch.pipeline.resume import ResumeLog
-    from mlbatch.pipeline.shard_part import ShardOutput
+    from mlbatch.pipeline.files import Files
+    from mlbatch.pipeline.shards import Shard
 
 
 class Target(NamedTuple):
@@ -109,54 +114,44 @@ def _run_one(job: Job, target: Target) -> list[str]:
         ply_style=target.ply_style,
         fsync=target.fsync,
         max_bag_s=job.max_bag_s,
-        share=(1, 1) if job.shard is None else (job.shard.number, job.shard.count),
     )
     check_options(name, options)
     check_variants(name, job.variants)
     if job.shard is not None:
-        _check_shard(target, name, job.max_bag_s)
+        _check_shard(target, name, options)
     jobs = jobs_for(target.jobs, name, options) if not target.dry_run else target.jobs or 1
     job = replace(job, extras=extras(name, options), jobs=jobs)
     report_path = target.report
     open_output: OpenWriter | None = None
-    resume_log = None
-    shard_output = None
+    files = None
     if target.written is not None:
         job = replace(job, record=record_layout(name, options))
         output = target.written
         preflight.check_output(job, output, name)
         if target.resume and _is_complete(job, output, target, name, options):
             return _beyond_limits_before(target, name)
-        resume_log = _resume_log(job, output, name, options, resumes=target.resume)
-        options = options._replace(kept_bytes=resume_log.kept_bytes, kept_crc=resume_log.kept_crc)
-        if options.kept_bytes is None:
+        files = _files(job, output, name, options, resumes=target.resume)
+        options = options._replace(files=files)
+        if not files.is_continued:
             check_target(name, output, options, job.layout)
             if warning := preflight.check_disk(job, output):
                 say(f"warning: {warning}")
-        if job.shard is not None:
-            from mlbatch.pipeline.shard_part import ShardOutput
-
-            shard_output = ShardOutput(job.shard, name, options, resume_log)
-        open_output = _opener(name, output, options, resume_log, shard_output)
-        if shard_output is None:
+        open_output = _opener(name, output, options, files)
+        if job.shard is None:
             report_path = report_path or report_paths(output, name).report
     preflight.check_report(job, report_path, target.written, name)
     _check_page(target, report_path, name)
     stages = ("clocks", "convert") if job.align_clocks_to else ("convert",)
     shown = not target.quiet
     with progress_bar(*stages, is_shown=shown, is_verbose=target.verbose) as progress:
-        conversion, inputs = _converted(
-            job,
-            open_output,
-            progress,
-            resume_log,
-            _last(target, report_path, resume_log, shard_output),
-        )
+        last = None if files is None else _last(target, report_path, name, options, files)
+        conversion, inputs = _converted(job, open_output, progress, files, last)
     inputs = inputs._replace(command=_command())
     for note in conversion.notes:
         say(f"warning: {note.code}: {note.message}")
-    if shard_output is not None:
-        _print_shard(shard_output, inputs, target)
+    if job.shard is not None and files is not None:
+        if not target.quiet:
+            _print_shard(job.shard, files, inputs, target)
         return []
     _write_page(conversion, inputs, target)
     if open_output is None and report_path is not None:
@@ -197,30 +192,33 @@ def _converted(
     job: Job,
     open_output: OpenWriter | None,
     progress: Progress | None,
-    resume_log: ResumeLog | None,
-    last: Last,
+    files: Files | None,
+    last: Last | None,
 ) -> tuple[Conversion, RunReport]:
     """Run a job; errors that leave a resumable output mention `--resume`."""
     try:
-        return convert(job, open_output, progress, resume_log, last)
+        return convert(job, open_output, progress, files, last)
     except (ExportError, RecordingError) as err:
         # A subclass has another cause than the disk.
         is_disk = isinstance(err.__cause__, OSError) and type(err) in (ExportError, RecordingError)
-        if resume_log is None or not resume_log.is_resumable or not is_disk:
+        if files is None or not files.is_resumable or not is_disk:
             raise
-        advice = f"then --resume continues after the {resume_log.recorded} scans that are safe"
+        advice = f"then --resume continues after the {files.scans} scans that are safe"
         raise type(err)(f"{err}; {advice}") from err
     except KeyboardInterrupt as err:
-        if resume_log is None or not resume_log.is_resumable:
+        if files is None or not files.is_resumable:
             raise
         raise Interrupted(
             "interrupted; finished scans are kept in .partial, from where --resume continues"
         ) from err
+    finally:
+        for line in () if files is None else files.changed:
+            say(line)
 
 
-def _check_shard(target: Target, name: str, max_bag_s: float) -> None:
+def _check_shard(target: Target, name: str, options: WriterOptions) -> None:
     """Refuse options that have no meaning for a shard; name: of the format."""
-    from mlbatch.pipeline.shard_part import check_format
+    from mlbatch.pipeline.shards import check_format
 
     given = {
         "--dry-run": target.dry_run,
@@ -235,48 +233,40 @@ def _check_shard(target: Target, name: str, max_bag_s: float) -> None:
                 f"--shard: expected no {option}, since a shard has a part of the points and no "
                 f"report, found both; leave {option} out, see mlbatch merge"
             )
-    check_format(name, plugin(name).SUFFIX, max_bag_s)
+    check_format(name, options)
 
 
-def _print_shard(output: ShardOutput, inputs: RunReport, target: Target) -> None:
+def _print_shard(shard: Shard, files: Files, inputs: RunReport, target: Target) -> None:
     """Print what a shard has written."""
-    account = output.account
-    if target.quiet or account is None:
-        return
-    number, count = account.shard.number, account.shard.count
     typer.echo(
         one_line(
-            f"wrote {target.written}: shard {number} of {count}, {len(account.scans)} of "
-            f"{account.total} scans, {inputs.scans.points} points; join all {count} with mlbatch "
-            "merge"
+            f"wrote {target.written}: shard {shard.number} of {shard.count}, {files.scans} of "
+            f"{files.total} scans, {inputs.scans.points} points; join all {shard.count} with "
+            "mlbatch merge"
         )
     )
 
 
 def _last(
-    target: Target,
-    report_path: Path | None,
-    resume_log: ResumeLog | None,
-    shard_output: ShardOutput | None,
+    target: Target, report_path: Path | None, name: str, options: WriterOptions, files: Files
 ) -> Last:
-    """Writes what an output has in the end: the report, or the account of a shard."""
-    if shard_output is None:
-        return _report_writer(target, report_path, resume_log)
-    complete = shard_output.complete
-    return lambda inputs, partial: complete(inputs._replace(command=_command()), partial)
+    """Writes what an output has in the end: the report, or the account of a shard.
 
-
-def _report_writer(target: Target, report_path: Path | None, resume_log: ResumeLog | None) -> Last:
-    """Writes the report before the output has its name, so that no output is without one."""
+    Before the output has its name, so that no output is without one.
+    """
 
     def write(inputs: RunReport, partial: Path) -> None:
-        if report_path is None or target.output is None or resume_log is None:
-            return
         from mlbatch.pipeline.job_identity import identity_of_parts
 
-        inputs = inputs._replace(
-            command=_command(), identity=identity_of_parts(resume_log.identity)
-        )
+        inputs = inputs._replace(command=_command())
+        if files.is_shard:
+            from mlbatch.pipeline.shards import write_account
+
+            write_account(partial, name, options, files, inputs)
+            return
+        if report_path is None or target.output is None:
+            return
+        inputs = inputs._replace(identity=identity_of_parts(files.identity))
         is_inside = report_path.parent.absolute() == target.output.absolute()
         path = partial / report_path.name if is_inside else report_path
         write_text(path, report_text(inputs), target.fsync)
@@ -326,19 +316,18 @@ def _write_page(conversion: Conversion, inputs: RunReport, target: Target) -> No
     write_page(target.html, Source(report, table, target.written, target.html))
 
 
-def _opener(
-    name: str,
-    output: Path,
-    options: WriterOptions,
-    resume_log: ResumeLog,
-    shard_output: ShardOutput | None,
-) -> OpenWriter:
+def _opener(name: str, output: Path, options: WriterOptions, files: Files) -> OpenWriter:
     def start(info: RunInfo) -> ScanWriter:
-        if options.kept_bytes is not None:
+        if files.is_continued:
             # Only now it is known that this is the job of the interrupted run.
-            say(f"{output}: resumed after {resume_log.done} scans")
+            say(f"{output}: resumed after {files.scans} scans")
         writer = open_writer(name, output, info, options)
-        return writer if shard_output is None else shard_output.around(writer, info)
+        if files.is_shard and not isinstance(writer, FilesWriter):
+            from mlbatch.pipeline.shards import not_in_files
+
+            writer.abandon()
+            raise not_in_files(name)
+        return writer
 
     return start
 
@@ -391,9 +380,7 @@ def _run_segments(job: Job, target: Target) -> list[str]:
             segment = TimeSegment(segment.begin_ns, jump.host_ns)
             if own_target.written is not None and (is_whole or not target.resume):
                 # Outputs of segments have other names.
-                from mlbatch.pipeline import resume
-
-                resume.abandon(own_target.written)
+                discard(own_target.written)
             continue
         except NoScanError as err:
             if is_whole:
@@ -412,11 +399,9 @@ def _run_segments(job: Job, target: Target) -> list[str]:
 
 
 def _refuse_jump(job: Job) -> None:
-    from mlbatch.pipeline import resume
-
-    jump = resume.find_jump(job)
-    if jump is not None:
-        raise jump
+    """Raise the first clock step in the session of a job; nothing is decoded."""
+    for _ in Conversion(job).windows():
+        pass
 
 
 def _numbered(target: Target, number: int) -> Target:
@@ -443,21 +428,15 @@ def _is_complete(job: Job, output: Path, target: Target, name: str, options: Wri
 
     UsageError if another job made the output; name: of the format.
     """
-    from mlbatch.pipeline import resume
-
-    earlier = resume.find(output)
-    # With --overwrite an older output is replaced, but not the one of the interrupted run.
-    if not earlier.is_complete or (target.overwrite and not earlier.was_published):
+    if target.overwrite or not output.exists() or partial_path(output).exists():
         return False
     changed = _difference_of_output(job, output, target, name, options)
-    if changed and target.overwrite:
-        return False
     if changed:
         raise UsageError(
             f"{output}: expected the complete output of this job for --resume, found {changed}; "
             "choose another output, or replace this one with --overwrite"
         )
-    resume.forget(output)
+    tidy(output)
     say(f"{output}: is complete; there is nothing to resume")
     return True
 
@@ -476,24 +455,26 @@ def _difference_of_output(
     return difference_of_outputs(identity, identity_of(job, name, options)) if identity else ""
 
 
-def _resume_log(
-    job: Job, output: Path, name: str, options: WriterOptions, *, resumes: bool
-) -> ResumeLog:
-    """Progress of an output: that of the interrupted run, or from the start."""
-    from mlbatch.pipeline import resume
+def _files(job: Job, output: Path, name: str, options: WriterOptions, *, resumes: bool) -> Files:
+    """The files of an output: those of the interrupted run as well, or all from the start."""
+    from mlbatch.pipeline.files import Files, find
 
-    earlier = resume.find(output)
-    state = earlier.state
-    if earlier.damage and resumes:
-        say(earlier.damage)
-    if state is not None and not resumes:
+    partial = partial_path(output)
+    old = partial.with_name(f"{partial.name}.state")
+    if old.is_file():
         say(
-            f"warning: interrupted: {output}.partial with {len(state.scans)} finished scans is "
+            f"{old}: expected {FILES_JSONL} in {partial}, found the state file of an earlier "
+            "version of mlbatch; it is removed, and all files are made again"
+        )
+        with export_errors(old):
+            old.unlink()
+    earlier = find(output)
+    if earlier is not None and not resumes:
+        say(
+            f"warning: interrupted: {partial} with {earlier.scans} finished scans is "
             "discarded; --resume would continue after them"
         )
-    log = resume.ResumeLog(output, job, name, options, state if resumes else None)
-    if log.kept_bytes is None:
-        resume.forget(output)
-        if resumes:
-            say(f"{output}: nothing to resume; started over")
-    return log
+    files = Files(output, job, name, options, earlier if resumes else None)
+    if resumes and not files.is_continued:
+        say(f"{output}: nothing to resume; started over")
+    return files

@@ -20,7 +20,7 @@ from mlbatch.decode.decoder import Decoder, Source
 from mlbatch.discovery.types import Note
 from mlbatch.errors import NoScanError, PacketError, UsageError
 from mlbatch.pipeline import run_report
-from mlbatch.pipeline.decode_pool import DecodePool, DecodeTask, Outcomes, with_own_lidars
+from mlbatch.pipeline.decode_pool import DecodePool, DecodeTask, with_own_lidars
 from mlbatch.pipeline.job import DEFAULT_RATE, Job
 from mlbatch.pipeline.passthrough import Passthrough
 from mlbatch.pipeline.point_notes import refuse_all_removed
@@ -95,9 +95,8 @@ class SkippedWindow(NamedTuple):
 class Conversion:
     """One run: `windows`, `tasks` or `scans` drive it, `close` ends it.
 
-    info, table: None before the first window; earlier: outcomes of the scans that a resumed output
-    already contains; dropped_incomplete: windows left out by `--drop-incomplete`;
-    notes_before_points: number of warnings that precede those about points.
+    info, table: None before the first window; dropped_incomplete: windows left out by
+    `--drop-incomplete`; notes_before_points: number of warnings that precede those about points.
     """
 
     def __init__(self, job: Job, buffers: int = 1, progress: Progress | None = None) -> None:
@@ -134,7 +133,6 @@ class Conversion:
         self.passthrough.refuse_unknown(self.session.recordings)
         self.info: RunInfo | None = None
         self.table: ScanTable | None = None
-        self.earlier: Iterator[Outcomes] = iter(())
         self.dropped_incomplete = 0
         self.notes_before_points = 0
         self.deskew = self._deskew()
@@ -254,7 +252,7 @@ class Conversion:
                 if self._is_too_incomplete(window):
                     yield SkippedWindow(window.end_ns)
                 else:
-                    yield from pool.tasks(window, self.earlier)
+                    yield from pool.tasks(window)
 
     def _batches(self, windows: Iterator[Window]) -> Iterator[Window]:
         """Yield what becomes a scan: windows, or the sets of sweeps in them, with their moves."""
@@ -343,8 +341,6 @@ class Conversion:
             split=job.split,
             counts_clipped=BYTE_INTENSITY in job.extras,
             own_times=job.batching_times == OWN,
-            shard=job.shard and job.shard.of_bag(job.max_bag_s, self.grid.rate),
-            slices=job.slices,
         )
         return self._pool
 
@@ -396,12 +392,12 @@ class Conversion:
 
     # -- accounting ---------------------------------------------------------------------------
 
-    def account(self, scan: Scan, checksum: int | None = None) -> None:
-        """Count a scan that is written, see `ScanJob`; call in the order of the scans."""
+    def account(self, scan: Scan, checksum: int | None = None, is_listed: bool = True) -> None:
+        """Count a scan that is written; call in the order of the scans; see `ScanTable.add`."""
         for sensor, count in zip(self.sensors, scan.columns_per_sensor, strict=True):
             sensor.ledger.columns.written += count
         if self.table is not None:
-            self.table.add(scan, checksum)
+            self.table.add(scan, checksum, is_listed)
 
     def points(self, sensor: int) -> PointCounts:
         """Point counters of a sensor so far."""

@@ -5,20 +5,17 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from copy import deepcopy
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, NamedTuple, TypeAlias
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
 from mlbatch.arrays import I64Array
 from mlbatch.batching.windows import Window
 from mlbatch.decode.decoder import Decoder, ScanHeader, Source
-from mlbatch.report.ledger import POINT_COUNTERS, PointCounts
+from mlbatch.report.ledger import PointCounts
 from mlbatch.types import NO_COLUMNS, ColumnFigures, Scan, WindowColumns
 from mlbatch.writers.output_file import crc32
 from mlbatch.writers.point_layouts import clipped_points
-
-if TYPE_CHECKING:
-    from mlbatch.pipeline.shards import Shard
 
 # Counts of the points of a scan, one list a sensor, in the order of `ledger.POINT_COUNTERS`.
 Outcomes: TypeAlias = Sequence[Sequence[int]]
@@ -35,7 +32,7 @@ class DecodeTask:
     columns: WindowColumns
     label: ScanHeader
     only: int | None  # with `--split` the index of their sensor
-    outcomes: Outcomes | None  # as in `Decoder.scan`
+    outcomes: Outcomes | None = None  # as in `Decoder.scan`
     is_decoded: bool = False
 
     @property
@@ -124,21 +121,15 @@ class DecodePool:
         split: bool,
         counts_clipped: bool = False,
         own_times: bool = False,
-        shard: Shard | None = None,
-        slices: int = 1,
     ) -> None:
         """workers: one a thread; each has lidars of its own if there are several.
 
-        own_times: times of points count from the first column of their sensor; shard: the only
-        scans to decode, None: all; slices: of a window.
+        own_times: times of points count from the first column of their sensor.
         Lidars have scratch memory, and the feeding thread reads column headers with them.
         """
         self._rings = [source.ring for source in sources]
         self._split = split
         self._own_times = own_times
-        self._shard = shard
-        self._slices = slices
-        self._no_points = [[0] * len(POINT_COUNTERS) for _ in sources]
         self._open: list[DecodeTask] = []
         self.workers = [
             DecodeWorker(
@@ -147,11 +138,8 @@ class DecodePool:
             for _ in range(workers)
         ]
 
-    def tasks(self, window: Window, earlier: Iterator[Outcomes]) -> Iterator[DecodeTask]:
-        """Yield the tasks of a window: one, or with `--split` one for each sensor in it.
-
-        earlier: outcomes of the scans that a resumed output already contains.
-        """
+    def tasks(self, window: Window) -> Iterator[DecodeTask]:
+        """Yield the tasks of a window: one, or with `--split` one for each sensor in it."""
         label = ScanHeader(
             window.index,
             window.slice,
@@ -167,7 +155,7 @@ class DecodePool:
         )
         columns = window.columns
         if not self._split:
-            yield self._task(columns, label, None, earlier)
+            yield self._task(columns, label, None)
             return
         for number, figures in enumerate(window.figures):
             if not figures.columns:
@@ -177,25 +165,12 @@ class DecodePool:
             part.sensor[:] = 0
             alone: list[ColumnFigures] = [NO_COLUMNS] * len(window.figures)
             alone[number] = figures
-            yield self._task(part, replace(label, figures=alone), number, earlier)
+            yield self._task(part, replace(label, figures=alone), number)
 
-    def _task(
-        self,
-        columns: WindowColumns,
-        label: ScanHeader,
-        only: int | None,
-        earlier: Iterator[Outcomes],
-    ) -> DecodeTask:
-        outcomes = next(earlier, None)
-        if outcomes is None and not self._is_own(label):
-            outcomes = self._no_points
-        task = DecodeTask(columns, label, only, outcomes)
+    def _task(self, columns: WindowColumns, label: ScanHeader, only: int | None) -> DecodeTask:
+        task = DecodeTask(columns, label, only)
         self._open.append(task)
         return task
-
-    def _is_own(self, label: ScanHeader) -> bool:
-        shard = self._shard
-        return shard is None or shard.has(label.index, label.slice, self._slices)
 
     def content(self, task: DecodeTask, before: int) -> int:
         """Checksum of a task's timestamps, of all packets up to its last, and of `before`."""

@@ -1,7 +1,7 @@
 """The identity of a job: options, versions and the content of its inputs, as texts.
 
 An interrupted run is resumed only by a job of the same identity. The content of recordings is
-sampled here, since they may have many gigabytes; `ResumeLog.take` compares what is read of them.
+sampled here, since they may have many gigabytes; `Files.take` compares what is read of them.
 """
 
 from __future__ import annotations

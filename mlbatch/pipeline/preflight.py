@@ -58,10 +58,7 @@ def check_output(job: Job, output: Path, name: str) -> None:
 
 def _own_files(output: Path, name: str) -> list[Path]:
     """Files that a run creates or removes, apart from those in an output folder."""
-    # Not loaded for dry runs.
-    from mlbatch.pipeline.state_file import state_path
-
-    files = [output, partial_path(output), old_path(output), state_path(output)]
+    files = [output, partial_path(output), old_path(output)]
     paths = report_paths(output, name)
     if paths.report.parent != output:
         files += [

@@ -24,10 +24,10 @@ from mlbatch.pipeline.workers import OrderedWorkers, run_inline
 from mlbatch.report.report import RunReport, fill_totals, imbalances, report_text
 from mlbatch.types import ImuSamples, Message, RunInfo, Summary
 from mlbatch.units import NS_PER_S
-from mlbatch.writers import ScanJob, ScanWriter
+from mlbatch.writers import FilesWriter, ScanJob, ScanWriter
 
 if TYPE_CHECKING:
-    from mlbatch.pipeline.resume import ResumeLog
+    from mlbatch.pipeline.files import Files
 
 OpenWriter = Callable[[RunInfo], ScanWriter]
 # Called with the content of the report and the complete output, before that gets its final name.
@@ -46,37 +46,35 @@ def convert(
     job: Job,
     open_writer: OpenWriter | None,
     progress: Progress | None = None,
-    resume_log: ResumeLog | None = None,
+    files: Files | None = None,
     last: Last | None = None,
 ) -> tuple[Conversion, RunReport]:
     """Run a job; returns the run and the content of its report.
 
-    open_writer: None in a dry run; resume_log: of the output, so that the run can be resumed.
+    open_writer: None in a dry run; files: of the output.
     """
     # One scan more than are waiting to be written: the one that is being decoded.
     decodes_ahead = job.jobs == 1 and open_writer is not None
     run = Conversion(job, buffers=_AHEAD + 1 if decodes_ahead else 1, progress=progress)
     return_freed_memory()
-    if resume_log is not None:
-        resume_log.join(run)
-    output = _Output(run, open_writer, resume_log)
+    if files is not None:
+        files.join(run)
+    output = _Output(run, open_writer, files)
     try:
         output.make(progress)
         run.close()
-        if resume_log is not None:
-            resume_log.complete()
+        if files is not None:
+            files.complete()
         inputs = _finish(run, output.writer, last)
-        if resume_log is not None:
-            resume_log.remove()
         output.writer = None
     except NoScanError:
-        output.discard()
+        if output.abandon() and files is not None:
+            files.discard()
         raise
     finally:
-        if output.writer is not None:
-            output.writer.abandon()
-        if resume_log is not None:
-            resume_log.sync()
+        output.abandon()
+        if files is not None:
+            files.close()
     return run, inputs
 
 
@@ -84,12 +82,12 @@ class _Output:
     """The output under construction; `writer` is None before the first scan, and in a dry run."""
 
     def __init__(
-        self, run: Conversion, open_writer: OpenWriter | None, resume_log: ResumeLog | None
+        self, run: Conversion, open_writer: OpenWriter | None, files: Files | None
     ) -> None:
         self.writer: ScanWriter | None = None
         self._run = run
         self._open_writer = open_writer
-        self._resume_log = resume_log
+        self._files = files
         self._idle: list[DecodeWorker] = []
         self._is_begun = False
         # Up to where IMU samples and messages were passed through.
@@ -137,14 +135,14 @@ class _Output:
     ) -> ScanTask:
         """following: of the scan that the messages precede, None if it is left out."""
         self._begin()
-        kept = None if self._resume_log is None else self._resume_log.take(before, task)
+        kept = None if self._files is None else self._files.take(before, task)
         return ScanTask(
             self._run,
             task,
             before,
             self.writer,
             self._idle,
-            self._resume_log,
+            self._files,
             kept=kept,
             index=None if following is None else following.label.index,
         )
@@ -156,18 +154,16 @@ class _Output:
         self._is_begun = True
         self._idle.extend(self._run.pool.workers)
         if self._open_writer is not None and self._run.info is not None:
-            if self._resume_log is not None:
-                # Locks the output before anything of it is touched: another run may have begun it.
-                self._resume_log.begin()
             self.writer = self._open_writer(self._run.info)
+            if self._files is not None and isinstance(self.writer, FilesWriter):
+                self._files.begin()
 
-    def discard(self) -> None:
-        """Remove the output: without a scan there is nothing to resume."""
-        if self.writer is not None:
-            self.writer.abandon()
-            self.writer = None
-        if self._resume_log is not None:
-            self._resume_log.discard()
+    def abandon(self) -> bool:
+        """Close an output that is not complete, if there is one; returns whether there was."""
+        writer, self.writer = self.writer, None
+        if writer is not None:
+            writer.abandon()
+        return writer is not None
 
 
 def _write_chunks(job: ScanJob) -> None:

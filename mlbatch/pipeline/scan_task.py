@@ -9,11 +9,10 @@ from typing import TYPE_CHECKING
 from mlbatch.pipeline.conversion import Conversion
 from mlbatch.pipeline.decode_pool import Decoded, DecodeTask, DecodeWorker
 from mlbatch.types import ImuSamples, Message
-from mlbatch.writers import ScanJob, ScanWriter
+from mlbatch.writers import FilesWriter, ScanJob, ScanWriter
 
 if TYPE_CHECKING:
-    from mlbatch.pipeline.resume import ResumeLog
-    from mlbatch.pipeline.state_file import FinishedScan
+    from mlbatch.pipeline.files import Files, FinishedScan
 
 
 class ScanTask:
@@ -26,7 +25,7 @@ class ScanTask:
         before: Sequence[ImuSamples | Message],
         writer: ScanWriter | None,
         idle: list[DecodeWorker],
-        resume_log: ResumeLog | None,
+        files: Files | None,
         *,
         kept: FinishedScan | None,
         index: int | None,
@@ -34,15 +33,15 @@ class ScanTask:
         """task: None where messages are to be written without a scan; before: what to write first.
 
         writer: None in a dry run; idle: decode workers, of which one is taken while in use;
-        kept: the scan, if a resumed output already contains it; index: of its window, None where no
-        scan follows the messages.
+        files: those of the output, None in a dry run; kept: the scan, if it is in a file of another
+        run; index: of its window, None where no scan follows the messages.
         """
         self._run = run
         self._task = task
         self._before = before
         self._writer = writer
         self._idle = idle
-        self._resume_log = resume_log
+        self._files = files
         self._kept = kept
         self._index = index
         self._worker: DecodeWorker | None = None
@@ -56,7 +55,8 @@ class ScanTask:
         if self._task is None:
             return
         began_s = time.perf_counter()
-        self._decoded = worker.decode(self._task, counts_points=self._resume_log is not None)
+        counts_points = self._files is not None and self._files.is_journaled
+        self._decoded = worker.decode(self._task, counts_points=counts_points)
         self._decode_s += time.perf_counter() - began_s
 
     def decode(self) -> None:
@@ -66,14 +66,15 @@ class ScanTask:
             self.decode_with(self._worker)
         if self._writer is not None:
             self._job = self._writer_job(self._writer)
-            if self._kept is not None:
-                self._job.checksum = self._kept.checksum
             self._timed(self._job.pack)
 
     def append(self) -> None:
         """Count the scan, write what precedes it, reserve its place in the output. In order."""
         if self._decoded is not None:
-            self._run.account(self._decoded.scan, self._job.checksum)
+            scan = self._decoded.scan
+            checksum = self._job.checksum if self._kept is None else self._kept.checksum
+            is_listed = self._files is None or self._files.is_listed(scan)
+            self._run.account(scan, checksum, is_listed)
         if self._index is not None:
             self._job.start(self._index)
         for item in self._before:
@@ -85,10 +86,12 @@ class ScanTask:
         self._timed(self._job.compress)
 
     def commit(self) -> None:
-        """Write what is complete; note it for `--resume`. In order."""
+        """Write what is complete; note the scan for its file. In order."""
+        if self._task is not None and self._decoded is not None and self._files is not None:
+            scan, outcomes = self._decoded
+            if self._kept is None:
+                self._files.note(scan, self._task.only, outcomes, self._job.checksum)
         self._timed(self._job.commit)
-        if self._decoded is not None and self._resume_log is not None and self._writer is not None:
-            self._resume_log.note(self._decoded.outcomes, self._job.checksum, self._writer)
         self._run.stages.write_s += self._write_s
         self._run.stages.decode_s += self._decode_s
         if self._worker is not None:
@@ -98,8 +101,9 @@ class ScanTask:
     def _writer_job(self, writer: ScanWriter) -> ScanJob:
         if self._task is None or self._decoded is None:
             return writer.flush()
-        write = writer.write if self._kept is None else writer.skip
-        return write(self._decoded.scan, self._task.only)
+        if self._kept is not None and isinstance(writer, FilesWriter):
+            return writer.skip(self._decoded.scan, self._task.only)
+        return writer.write(self._decoded.scan, self._task.only)
 
     def _timed(self, stage: Callable[[], None]) -> None:
         if self._writer is None:

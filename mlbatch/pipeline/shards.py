@@ -1,19 +1,41 @@
-"""Time shards: each of N runs makes every Nth scan of one recording (`--shard K/N`).
-
-Of a ROS 2 bag of several files (`--max-bag-duration`) it makes every Nth file.
+"""Shards: each of N runs makes every Nth file of an output (`--shard K/N`), `mlbatch merge` joins.
 
 Every shard reads and batches the whole recording, since the first look, the first window, losses
-and clocks depend on all of it. It decodes and writes its own scans only, which is what costs most.
+and clocks depend on all of it. It decodes and writes its own files only, which is what costs most;
+see `files.py`. Its folder is that of one run with a part of the files and of the rows of scans.csv.
+Instead of report.json it has `files.jsonl` and shard.json: the account of the whole recording, with
+the points of its own scans. From those of all shards the report follows.
 """
 
 from __future__ import annotations
 
+import json
 import re
-from dataclasses import dataclass, replace
-from fractions import Fraction
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
 
-from mlbatch.errors import UsageError
-from mlbatch.writers.base import windows_per_file
+import mlbatch
+from mlbatch.bounded import parse_json, read_text
+from mlbatch.errors import RecordingError, UsageError
+from mlbatch.pipeline.files import Files, records
+from mlbatch.pipeline.job_identity import identity_of_parts
+from mlbatch.report.json_records import from_json, to_json
+from mlbatch.report.report import RunReport
+from mlbatch.writers import (
+    FILES_JSONL,
+    SCANS_CSV,
+    SHARD_JSON,
+    WriterOptions,
+    export_errors,
+    has_several_files,
+    partial_path,
+    write_text,
+)
+from mlbatch.writers.bag_metadata import METADATA
+from mlbatch.writers.output_file import crc32, file_crc
+
+SCHEMA = "mlbatch.shard/4"
 
 
 @dataclass(frozen=True, slots=True)
@@ -22,23 +44,13 @@ class Shard:
 
     number: int  # from 1
     count: int
-    windows: int = 0  # in a file of a bag; 0: every scan has files of its own
-
-    def of_bag(self, max_bag_s: float, rate: Fraction) -> Shard:
-        """The shard of an output; max_bag_s: as of `Job`; rate: Hz."""
-        return replace(self, windows=windows_per_file(max_bag_s, rate)) if max_bag_s else self
 
     def __str__(self) -> str:
         return f"{self.number}/{self.count}"
 
-    def has(self, index: int, slice_: int, slices: int) -> bool:
-        """Whether the scan of a window (-1: the head) or slice is of this shard.
-
-        It depends on time alone: on neither the engine nor how packets are read.
-        """
-        # The head is in the first file of a bag.
-        unit = max(index, 0) // self.windows if self.windows else index * slices + slice_
-        return unit % self.count == self.number - 1
+    def has(self, file: int) -> bool:
+        """Whether a file is of this shard, by its number."""
+        return file % self.count == self.number - 1
 
 
 def parse_shard(text: str) -> Shard:
@@ -50,3 +62,153 @@ def parse_shard(text: str) -> Shard:
             f"--shard: expected K/N with K from 1 to N, found {text!r}; write --shard 1/8"
         )
     return shard
+
+
+def check_format(name: str, options: WriterOptions) -> None:
+    """Raise UsageError for a format whose scans are in one file."""
+    if has_several_files(name, options):
+        return
+    if name == "rosbag2":
+        raise UsageError(
+            "--shard: expected --max-bag-duration for rosbag2, since a shard writes whole files of "
+            "the bag, found none; give --max-bag-duration 60"
+        )
+    raise not_in_files(name)
+
+
+def not_in_files(name: str) -> UsageError:
+    """The error about a format that writes one file; name: of the format."""
+    return UsageError(
+        f"--shard: expected a format with several files (npz, ply, pcd, las, laz, kitti, nuscenes; "
+        f"rosbag2 with --max-bag-duration), found {name}, one file for all scans; give --format "
+        "npz and a folder, or --format rosbag2 --max-bag-duration 60"
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class Account:
+    """Content of shard.json.
+
+    identity: what all shards share, see `identity_of_parts`; content: checksum of what was read;
+    windows: as of `Files`; total: number of scans of all shards, scans: of this one; table:
+    CRC-32 of scans.csv; lists: CRC-32 of files about all scans, by path in the folder;
+    notes_before_points: warnings of the report that precede those about points.
+    """
+
+    shard: Shard
+    identity: dict[str, str]
+    content: int
+    format: str
+    windows: int
+    is_strict: bool
+    total: int
+    scans: int
+    table: int
+    lists: dict[str, int]
+    notes_before_points: int
+    report: RunReport
+
+    def shared(self) -> dict[str, Any]:
+        """What must be the same in the accounts of all shards, as JSON values."""
+        found = _fields(to_json(self))
+        for name in ("shard", "scans", "table"):
+            del found[name]
+        report = found["report"]
+        for name in ("timing", "command"):
+            del report[name]
+        for one in report["inputs"]:
+            one["path"] = Path(one["path"]).name
+        for sensor in report["sensors"]:
+            del sensor["ledger"]["points"]
+        for name in ("points", "no_points", "empty_clouds"):
+            del report["scans"][name]
+        return found
+
+
+def write_account(
+    folder: Path, name: str, options: WriterOptions, files: Files, report: RunReport
+) -> None:
+    """Write shard.json into the folder of a shard; name: of the format."""
+    run = files.run
+    if run is None or run.job.shard is None or run.table is None:
+        return
+    with export_errors(folder):
+        own = {one for _, record in records(folder / FILES_JSONL) for one in record.crcs}
+        own |= {FILES_JSONL, SCANS_CSV, METADATA}
+        paths = filter(Path.is_file, folder.rglob("*"))
+        others = {path.relative_to(folder).as_posix() for path in paths} - own
+        lists = {one: file_crc(folder / one) for one in sorted(others)}
+    account = Account(
+        shard=run.job.shard,
+        identity=identity_of_parts(files.identity),
+        content=files.content,
+        format=name,
+        windows=files.windows,
+        is_strict=run.job.strict,
+        total=files.total,
+        scans=files.scans,
+        table=crc32(run.table.text().encode(), 0),
+        lists=lists,
+        notes_before_points=run.notes_before_points,
+        report=report,
+    )
+    head = {"schema": SCHEMA, "version": mlbatch.__version__}
+    text = json.dumps(head | _fields(to_json(account)), separators=(",", ":"))
+    write_text(folder / SHARD_JSON, text + "\n", options.fsync)
+
+
+def read_account(part: Path) -> Account:
+    """The account of a shard; UsageError if there is none, RecordingError if it is damaged."""
+    path = part / SHARD_JSON
+    try:
+        content = _fields(parse_json(read_text(path), has_nan=True))
+    except FileNotFoundError:
+        raise UsageError(f"{part}: expected the folder of a shard, found {_found(part)}") from None
+    except NotADirectoryError:
+        raise UsageError(
+            f"{part}: expected the folder of a shard, found a file; name what convert --shard wrote"
+        ) from None
+    except OSError as err:
+        raise RecordingError(
+            f"{path}: expected a readable file, found {err.strerror!r}; check the disk"
+        ) from err
+    except ValueError as err:
+        raise _damaged(path, str(err)) from err
+    schema = content.pop("schema", None)
+    version = content.pop("version", None)
+    if schema != SCHEMA:
+        raise UsageError(
+            f"{path}: expected schema {SCHEMA}, found {schema!r}; name what convert --shard wrote"
+        )
+    if version != mlbatch.__version__:
+        raise UsageError(
+            f"{path}: expected a shard of mlbatch {mlbatch.__version__}, found one of "
+            f"{version}; merge with that version, or convert again"
+        )
+    try:
+        account: Account = from_json(Account, content)
+    except (ValueError, TypeError) as err:
+        raise _damaged(path, str(err)) from err
+    return account
+
+
+def _damaged(path: Path, why: str) -> RecordingError:
+    return RecordingError(
+        f"{path}: expected the account of a shard, found damaged content ({why}); convert this "
+        "shard again with --overwrite"
+    )
+
+
+def _found(part: Path) -> str:
+    partial = partial_path(part)
+    if partial.exists():
+        return f"that of an interrupted run ({partial.name}); run this shard again with --resume"
+    if part.is_dir():
+        return f"a folder without {SHARD_JSON}; name what convert --shard wrote"
+    return "nothing; run the conversion of this shard, or check the name"
+
+
+def _fields(found: object) -> dict[str, Any]:
+    if not isinstance(found, dict):
+        raise ValueError("no JSON object")
+    return found

@@ -7,10 +7,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from mlbatch.pipeline import preflight, resume
+from mlbatch.pipeline import preflight
+from mlbatch.pipeline.files import Files
 from mlbatch.pipeline.job import Job, check_max_bag_s
 from mlbatch.pipeline.job_identity import identity_of_parts
-from mlbatch.pipeline.resume import ResumeLog
 from mlbatch.pipeline.run import convert
 from mlbatch.python.options import OutputOptions, choice, names_of, path_of
 from mlbatch.report.ledger import SensorLedger
@@ -144,9 +144,8 @@ def run_job(job: Job, output: Path | None, options: OutputOptions) -> Run:
         return Run(None, Report(content), report)
     preflight.check_output(job, output, name)
     job = replace(job, record=record_layout(name, writer_options))
-    # Also locks the output against other runs.
-    log = ResumeLog(output, job, name, writer_options, None)
-    resume.forget(output)
+    files = Files(output, job, name, writer_options, None)
+    writer_options = writer_options._replace(files=files)
     check_target(name, output, writer_options, job.layout)
     if shortage := preflight.check_disk(job, output):
         warnings.warn(shortage, stacklevel=3)
@@ -159,10 +158,10 @@ def run_job(job: Job, output: Path | None, options: OutputOptions) -> Run:
 
     def write_report(content: RunReport, partial: Path) -> None:
         path = partial / report_path.name if is_inside else report_path
-        content = content._replace(identity=identity_of_parts(log.identity))
+        content = content._replace(identity=identity_of_parts(files.identity))
         write_text(path, report_text(content), writer_options.fsync)
         if writer_options.fsync and path.parent.absolute() != output.parent.absolute():
             sync_entries(path.parent)
 
-    _, content = convert(job, opener, None, log, write_report)
+    _, content = convert(job, opener, None, files, write_report)
     return Run(output, Report(content), report_path)

@@ -98,12 +98,15 @@ class ScanTable:
         self._append(header.getvalue())
         self._columns_per_s = tuple(columns_per_s) or (None,) * len(names)
 
-    def add(self, scan: Scan, checksum: int | None = None) -> None:
-        """Add a written scan; checksum: see `writers.ScanJob`."""
-        row = _Row.of(scan, checksum)
+    def add(self, scan: Scan, checksum: int | None = None, is_listed: bool = True) -> None:
+        """Add a scan; checksum: see `writers.ScanJob`.
+
+        is_listed: False for a scan of another shard, whose points are unknown: it has no row.
+        """
+        row = _Row.of(scan, checksum, is_listed)
         if self.first_start_ns is None:
             self.first_start_ns = scan.start_ns
-        self._empty_clouds += not scan.points
+        self._empty_clouds += is_listed and not scan.points
         pending = self._pending
         if pending and pending[-1].key == row.key:
             pending[-1] = pending[-1].joined(row)
@@ -156,7 +159,7 @@ class ScanTable:
     def _format(self) -> None:
         """Append the pending rows to the table and to the statistics."""
         rows = self._pending
-        self._append("".join(map(self._line, rows)))
+        self._append("".join(self._line(row) for row in rows if row.is_listed))
         for row in rows:
             self._incomplete += not row.complete
             self._points += row.points
@@ -185,7 +188,7 @@ class ScanTable:
         is_underfilled = False
         filled = zip(self._totals, row.columns, row.points_of, row.fill, strict=True)
         for one, columns, points, fill in filled:
-            one.add(columns, points, fill)
+            one.add(columns, points if row.is_listed else None, fill)
             is_underfilled |= fill < UNDERFILLED
         self._underfilled += is_underfilled
 
@@ -210,9 +213,10 @@ class _SensorTotals:
     known: int = 0  # scans whose fill is known
     fill: float = 0.0  # sum over them
 
-    def add(self, columns: int, points: int, fill: float) -> None:
+    def add(self, columns: int, points: int | None, fill: float) -> None:
+        """points: None if unknown."""
         self.without += not columns
-        self.no_points += bool(columns) and not points
+        self.no_points += bool(columns) and points == 0
         self.underfilled += fill < UNDERFILLED
         if not math.isnan(fill):
             self.known += 1
@@ -243,9 +247,10 @@ class _Row(NamedTuple):
     points_of: tuple[int, ...]
     is_partial: bool
     checksum: int
+    is_listed: bool
 
     @classmethod
-    def of(cls, scan: Scan, checksum: int | None) -> _Row:
+    def of(cls, scan: Scan, checksum: int | None, is_listed: bool) -> _Row:
         """The row of one scan."""
         stamps = scan.column_stamp_ns
         nothing = (0.0,) * len(scan.columns_per_sensor)
@@ -266,6 +271,7 @@ class _Row(NamedTuple):
             scan.points_per_sensor,
             scan.is_partial,
             NO_CHECKSUM if checksum is None else checksum,
+            is_listed,
         )
 
     def joined(self, other: _Row) -> _Row:
@@ -290,6 +296,7 @@ class _Row(NamedTuple):
             NO_CHECKSUM
             if NO_CHECKSUM in (self.checksum, other.checksum)
             else (self.checksum + other.checksum) % _CHECKSUMS,
+            self.is_listed,
         )
 
     def places(self) -> str:
@@ -331,6 +338,18 @@ def _share_cells(
 def _fill_cell(fill: float) -> str:
     # The shortest text of a float32.
     return UNKNOWN if math.isnan(fill) else str(np.float32(fill))
+
+
+def merged_table(tables: Sequence[str]) -> str:
+    """The table of all scans from those of shards, which share no row."""
+    header = ""
+    rows: list[tuple[int, int, str]] = []
+    for table in tables:
+        header, *lines = table.splitlines(keepends=True)
+        for line in lines:
+            index, slice_, _ = line.split(",", 2)
+            rows.append((int(index), int(slice_), line))
+    return header + "".join(line for *_, line in sorted(rows))
 
 
 def _counted(counts: dict[str, int]) -> dict[str, int]:

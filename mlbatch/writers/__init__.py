@@ -6,33 +6,35 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from mlbatch.errors import UsageError
 from mlbatch.writers.atomic import (
+    FILES_JSONL,
     REPORT_JSON,
     SCANS_CSV,
     SHARD_JSON,
     check_free_space,
     check_name,
     discard,
-    discard_old,
     export_errors,
     free_bytes,
     is_report,
     is_taken,
+    locked,
     old_path,
     partial_path,
+    prepare,
     side_path,
+    tidy,
     write_text,
 )
 from mlbatch.writers.base import (
     NO_COMPRESSION,
     PLY_STYLES,
-    Checkpoint,
-    PartWriter,
+    FilesWriter,
     ScanJob,
     ScanWriter,
     WriterModule,
     WriterOptions,
 )
-from mlbatch.writers.durable import sync_entries, sync_to_disk
+from mlbatch.writers.durable import sync_entries
 from mlbatch.writers.formats import (
     built_in_names,
     format_module,
@@ -50,10 +52,11 @@ if TYPE_CHECKING:
     from mlbatch.types import RecordLayout, RunInfo
 
 __all__ = [
+    "FILES_JSONL",
     "REPORT_JSON",
+    "SCANS_CSV",
     "SHARD_JSON",
-    "Checkpoint",
-    "PartWriter",
+    "FilesWriter",
     "ReportPaths",
     "ScanJob",
     "ScanWriter",
@@ -66,23 +69,25 @@ __all__ = [
     "check_variants",
     "choose_format",
     "discard",
-    "discard_old",
     "export_errors",
     "extras",
     "format_names",
     "free_bytes",
+    "has_several_files",
     "is_report",
     "is_taken",
     "jobs_for",
+    "locked",
     "old_path",
     "open_writer",
     "parse_jobs",
     "partial_path",
     "plugin",
+    "prepare",
     "record_layout",
     "report_paths",
     "sync_entries",
-    "sync_to_disk",
+    "tidy",
     "write_text",
 ]
 
@@ -192,6 +197,11 @@ def record_layout(name: str, options: WriterOptions) -> RecordLayout | None:
     return None if own is None else own(options)
 
 
+def has_several_files(name: str, options: WriterOptions) -> bool:
+    """Return whether an output consists of files that several runs may make."""
+    return plugin(name).SUFFIX is None and (name != "rosbag2" or options.max_bag_s > 0)
+
+
 def check_options(name: str, options: WriterOptions) -> None:
     """Refuse options that the format does not have, or unknown values of them."""
     check_compression(name, options)
@@ -250,5 +260,5 @@ def check_target(name: str, target: Path, options: WriterOptions, layout: str) -
     from mlbatch.types import RunInfo
 
     info = RunInfo((), "", "10", "unknown", layout=layout)
-    open_writer(name, target, info, options._replace(split=False)).abandon()
+    open_writer(name, target, info, options._replace(split=False, files=None)).abandon()
     discard(target)

@@ -4,11 +4,15 @@ An output is written to `<OUTPUT>.partial` and renamed at the end. A killed run 
 `.partial`; the next run to the same output continues it (`--resume`) or replaces it. A power cut
 leaves the old or the new output: the data are forced to the disk before the output is renamed, and
 its name after that, unless `--no-fsync` is given.
+
+A run locks its `.partial`: the file, or `files.jsonl` in the folder. No other run writes it then.
 """
 
 from __future__ import annotations
 
 import contextlib
+import fcntl
+import io
 import os
 import re
 import shutil
@@ -23,15 +27,18 @@ from mlbatch.writers.formats import format_of_files
 PARTIAL_SUFFIX = ".partial"
 SCANS_CSV = "scans.csv"
 REPORT_JSON = "report.json"
-# In a folder with the scans of one shard, instead of both.
+# In a folder with the files of one shard, instead of the report.
 SHARD_JSON = "shard.json"
+# In a folder under construction, and in that of a shard: the files that are whole, see
+# `pipeline/files.py`.
+FILES_JSONL = "files.jsonl"
 # Files that a run writes into a folder. A folder with any other file is never replaced.
 _SCAN_FILE = r"(\d{6,}|head)(-\d+)?\.([\w.]+)"
 # Names that only mlbatch gives, or that its first versions wrote without a scans.csv.
 _UNMARKED = ("npz", "ply")
-# The same for a ROS 2 bag and for lists of times. Other programs write such files too, and scans
-# of other formats: scans.csv marks an own output.
-_SHARED_FILE = r".+_\d+\.mcap|metadata\.yaml|times\.txt"
+# The same for a ROS 2 bag, lists of times and of files. Other programs write such files too, and
+# scans of other formats: scans.csv marks an own output.
+_SHARED_FILE = r".+_\d+\.mcap|metadata\.yaml|times\.txt|files\.jsonl"
 # A report may have any name (`--report`); it is recognised by its first bytes, in any version.
 _REPORT = rb'\{\s*"schema":\s*"mlbatch\.report/'
 _HEAD_BYTES = 64
@@ -53,7 +60,8 @@ class Output(NamedTuple):
     target: Path  # final path
     partial: Path  # path until `publish`
     overwrite: bool  # whether an earlier output at `target` may be replaced
-    fsync: bool = False  # whether data and names are forced to the disk
+    fsync: bool  # whether data and names are forced to the disk
+    lock: io.FileIO  # keeps other runs away from `partial`
 
     def sync(self) -> None:
         """Force the data to the disk; call before the report of the output is written."""
@@ -68,16 +76,17 @@ class Output(NamedTuple):
                 # The report in it is newer than `sync`.
                 self._sync_entries(self.partial)
             self._move()
+            self.close()
+            tidy(self.target, self.fsync)
             self._sync_entries(self.target.parent)
 
+    def close(self) -> None:
+        """Let other runs use what is under construction."""
+        self.lock.close()
+
     def _move(self) -> None:
-        old = old_path(self.target)
         if not os.path.lexists(self.target):
             self.partial.rename(self.target)
-            # Left by a run that was killed between the two renames of a folder.
-            if old.exists():
-                self._sync_entries(self.target.parent)
-                _remove(old)
             return
         _check_replaceable(self.target, self.overwrite, self.partial.is_dir())
         if self.target.is_dir():
@@ -99,9 +108,6 @@ class Output(NamedTuple):
         except OSError:
             old.rename(self.target)
             raise
-        # Until now a power cut may bring the old name back.
-        self._sync_entries(self.target.parent)
-        shutil.rmtree(old)
 
 
 def is_taken(name: str) -> bool:
@@ -143,7 +149,7 @@ def check_name(target: Path) -> None:
 def prepare(
     target: Path, overwrite: bool, folder: bool, keep: bool = False, fsync: bool = False
 ) -> Output:
-    """Check that `target` can be written; create a new `.partial` unless `keep`.
+    """Check that `target` can be written; lock its `.partial`, and empty it unless `keep`.
 
     fsync: as in `Output`.
     """
@@ -151,15 +157,42 @@ def prepare(
     if os.path.lexists(target):
         _check_replaceable(target, overwrite, folder)
     partial = partial_path(target)
-    if keep:
-        return Output(target, partial, overwrite, fsync)
     with export_errors(partial):
-        _remove(partial)
+        fits = partial.is_dir() if folder else partial.is_file()
+        if not keep and (partial.is_symlink() or not fits):
+            _remove(partial)
         if folder:
-            partial.mkdir()
-        else:
-            partial.touch()
-    return Output(target, partial, overwrite, fsync)
+            partial.mkdir(exist_ok=True)
+        lock = locked(target, partial / FILES_JSONL if folder else partial)
+        if not keep:
+            lock.truncate(0)
+            for entry in partial.iterdir() if folder else ():
+                if entry.name != FILES_JSONL:
+                    _remove(entry)
+    return Output(target, partial, overwrite, fsync, lock)
+
+
+def locked(target: Path, path: Path) -> io.FileIO:
+    """Open a file that all runs to `target` lock, created if absent; ExportError while one has it.
+
+    The system releases the lock of a killed run.
+    """
+    file = io.FileIO(path, "a+")
+    with contextlib.suppress(OSError):
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            # Another run may have completed or removed it in between.
+            is_free = path.exists() and os.path.samestat(os.fstat(file.fileno()), path.stat())
+        except BlockingIOError:
+            is_free = False
+        if not is_free:
+            file.close()
+            raise ExportError(
+                f"{target}: expected no other run that writes it, found one; wait for its end or "
+                "choose another output"
+            )
+    # Some network file systems have no locks.
+    return file
 
 
 def discard(target: Path) -> None:
@@ -179,10 +212,17 @@ def old_path(target: Path) -> Path:
     return target.with_name(f"{target.name}.old{PARTIAL_SUFFIX}")
 
 
-def discard_old(target: Path) -> None:
-    """Remove the replaced folder of a run that was killed right after its output was complete."""
+def tidy(target: Path, fsync: bool = True) -> None:
+    """Remove what is of no use once `target` is complete; a killed run may have left it."""
+    old = old_path(target)
     with export_errors(target):
-        _remove(old_path(target))
+        if old.exists():
+            # Until now a power cut may bring the old name back.
+            if fsync:
+                sync_entries(target.parent)
+            _remove(old)
+        if target.is_dir() and not (target / SHARD_JSON).exists():
+            (target / FILES_JSONL).unlink(missing_ok=True)
 
 
 def side_path(target: Path, name: str) -> Path:

@@ -6,7 +6,7 @@ from fractions import Fraction
 from typing import TYPE_CHECKING, NamedTuple, Protocol, runtime_checkable
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Mapping
     from pathlib import Path
 
     from mlbatch.types import ImuSamples, Message, RunInfo, Scan, Summary
@@ -24,32 +24,34 @@ class WriterOptions(NamedTuple):
     point_layout: str = DEFAULT_POINT_LAYOUT  # preset of PointCloud2 fields
     overwrite: bool = False  # replace an existing output at the end
     split: bool = False  # one output stream per sensor instead of merged scans
-    # Bytes to keep of the file in an existing `.partial` (0 where each scan is a file); None: start
-    # a new `.partial`.
-    kept_bytes: int | None = None
-    kept_crc: int = 0  # CRC-32 of these bytes
     compression: str = NO_COMPRESSION  # none, lz4 or zstd[:level]
     ply_style: str = PLY_STYLES[0]  # names and types of PLY properties
     fsync: bool = True  # force the output to the disk before it gets its name
     max_bag_s: float = 0.0  # recorded time in a file of a ROS 2 bag, s; 0: all in one file
-    # Number and count of shards: the only files of a bag to write are the Kth, (K + N)th, ...
-    share: tuple[int, int] = (1, 1)
+    files: FileSet | None = None  # those that this run is to make; None: all
 
 
-class Checkpoint(NamedTuple):
-    """Written data that survive a kill of the process: the first `scans`, and their bytes."""
+class FileSet(Protocol):
+    """The files of an output of several, as its writer sees them; see `pipeline/files.py`.
 
-    scans: int
-    kept_bytes: int = 0  # length of the part of the output file with these scans
-    kept_crc: int = 0  # CRC-32 of that part
+    A file is named by its scan: index, slice and, with `--split`, sensor; one of a bag by the index
+    of any of its windows.
+    """
 
+    @property
+    def is_continued(self) -> bool:
+        """Whether the folder under construction has files that are whole."""
+        ...
 
-class Written(NamedTuple):
-    """What the system has of an output file."""
+    def is_due(self, index: int, slice_: int = 0, sensor: int | None = None) -> bool:
+        """Whether this run is to make a file."""
+        ...
 
-    chunks: int
-    kept_bytes: int  # up to the end of these chunks
-    kept_crc: int  # CRC-32 of these bytes
+    def made(
+        self, crcs: Mapping[str, int], index: int, slice_: int = 0, sensor: int | None = None
+    ) -> None:
+        """Note a file that is whole; crcs: CRC-32 by name, as a scan may have two. In order."""
+        ...
 
 
 class ScanJob:
@@ -60,8 +62,7 @@ class ScanJob:
     each after the same stage of all earlier jobs.
 
     checksum: from `pack` on, the sum of the CRC-32 of the files of the scan, or that of the data of
-    its message, as `scans.csv` has it; None: not known. Of a scan that is skipped it is set before,
-    as it was written.
+    its message, as `scans.csv` has it; None: not known.
     """
 
     checksum: int | None = None
@@ -89,8 +90,8 @@ class ScanWriter(Protocol):
     """Writer of one run; there is no file at the final path before `finish`.
 
     Stages of jobs may run in several threads, see `ScanJob`. IMU samples and messages are written
-    right before an `append`, `checkpoint` is called right after a `commit`, both in that order;
-    other jobs may be in other stages then. `finish` is called when all jobs are done.
+    right before an `append`; other jobs may be in other stages then. `finish` is called when all
+    jobs are done.
     """
 
     def write(self, scan: Scan, sensor: int | None = None) -> ScanJob:
@@ -100,19 +101,8 @@ class ScanWriter(Protocol):
         """
         ...
 
-    def skip(self, scan: Scan, sensor: int | None = None) -> ScanJob:
-        """Return the job for a scan that the kept part of a `.partial` contains.
-
-        Only the number of its points is used, not their values.
-        """
-        ...
-
     def flush(self) -> ScanJob:
         """Return the job that writes complete chunks of messages where no scan follows them."""
-        ...
-
-    def checkpoint(self) -> Checkpoint:
-        """Return what a resumed run need not write again; hands it to the system first."""
         ...
 
     def write_imu(self, samples: ImuSamples) -> None:
@@ -136,27 +126,13 @@ class ScanWriter(Protocol):
 
 
 @runtime_checkable
-class PartWriter(ScanWriter, Protocol):
-    """A writer whose files depend on no other scans: each can be written by a shard of a run."""
+class FilesWriter(ScanWriter, Protocol):
+    """A writer of several files, each independent of the others; reports them to a `FileSet`."""
 
-    @property
-    def bag_files(self) -> int:
-        """Number of files that all shards have begun; 0 where every scan has files of its own."""
-        ...
+    def skip(self, scan: Scan, sensor: int | None = None) -> ScanJob:
+        """Return the job of a scan in a file that is not due here; call it in the order of scans.
 
-    @property
-    def checksums(self) -> dict[str, int]:
-        """CRC-32 of the complete files of several scans, by name."""
-        ...
-
-    def pass_over(self, scan: Scan) -> ScanJob:
-        """Return the job of a scan that another shard writes; call it in the order of the scans."""
-        ...
-
-    def finish_part(self, last: Callable[[Path], None] | None = None) -> None:
-        """Complete the files of the shard, and move their folder to its final path.
-
-        last: as in `finish`.
+        The points of the scan are not used.
         """
         ...
 

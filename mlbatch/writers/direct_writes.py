@@ -26,10 +26,7 @@ _STAGE_BYTES = 2 << 20
 
 
 class DirectWrites:
-    """Appends to an open file from `position` on; other writes to it must be complete.
-
-    handed_bytes: bytes of the file that the system has.
-    """
+    """Appends to an open file from `position` on; other writes to it must be complete."""
 
     def __init__(self, descriptor: int, position: int) -> None:
         """descriptor: open for reading and writing."""
@@ -37,7 +34,6 @@ class DirectWrites:
         self._stage = mmap.mmap(-1, _STAGE_BYTES)
         self._bytes: npt.NDArray[np.uint8] = np.frombuffer(self._stage, np.uint8)
         # The begun block is written again as a whole.
-        self.handed_bytes = position
         self._base = position - position % BLOCK_BYTES
         self._filled = position - self._base
         self._bytes[: self._filled] = np.frombuffer(
@@ -87,7 +83,6 @@ class DirectWrites:
                 self._leave()
         self._base += self._filled
         self._filled = 0
-        self.handed_bytes = self._base
 
     def _leave(self) -> None:
         if self._is_direct:

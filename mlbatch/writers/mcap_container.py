@@ -9,7 +9,6 @@ from __future__ import annotations
 import importlib
 import re
 import struct
-from collections import deque
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -35,11 +34,11 @@ from mcap.records import (
 )
 
 import mlbatch
-from mlbatch.errors import ExportError, UsageError
+from mlbatch.errors import UsageError
 from mlbatch.ros.definitions import definition, is_known, qos, qos_in_numbers
 from mlbatch.types import Message, Summary, Topic
 from mlbatch.writers.atomic import SCANS_CSV
-from mlbatch.writers.base import NO_COMPRESSION, Written
+from mlbatch.writers.base import NO_COMPRESSION
 from mlbatch.writers.output_file import Bytes, OutputFile, borrow, crc32, joined_crc
 
 # Compresses so many bytes, given in parts, to one frame.
@@ -76,7 +75,6 @@ class Chunk:
     records: list[Bytes]
     # Log time and offset of the messages of each channel.
     index: dict[int, list[tuple[int, int]]]
-    is_kept: bool  # whether a continued file contains it
     last_crc: int | None = None  # of the last part, if known
     # Of the records, and of what is stored, once they are compressed.
     crc: int = 0
@@ -96,8 +94,6 @@ class Chunk:
 
     def compress(self) -> None:
         """Compress the records and compute their checksum. Any thread."""
-        if self.is_kept:
-            return
         *parts, last = self.records
         self.crc = _crc_of(parts)
         if self.last_crc is None:
@@ -125,18 +121,16 @@ class McapContainer:
     def __init__(
         self,
         path: Path,
-        kept_bytes: int | None,
         compression: str = NO_COMPRESSION,
         check_topic: Callable[[Topic], None] | None = None,
         on_finish: Callable[[McapContainer], None] | None = None,
-        kept_crc: int = 0,
     ) -> None:
-        """Create a file, or continue the first `kept_bytes` of an existing one, of this CRC-32.
+        """Create a file.
 
         compression: as in `--compression`; check_topic: called with each forwarded topic, raises
         ExportError to refuse it; on_finish: called once the file is complete and closed.
         """
-        self._file = OutputFile(path, kept_bytes, kept_crc)
+        self._file = OutputFile(path)
         self._compression, self._new_compress = compression_of(compression)
         self._check_topic = check_topic
         self._on_finish = on_finish
@@ -149,19 +143,12 @@ class McapContainer:
         # The chunk under construction.
         self._records = bytearray()
         self._index: dict[int, list[tuple[int, int]]] = {}
-        self._complete_chunks = 0
         self._pending: list[Chunk] = []  # complete and not taken
         self._chunks: list[ChunkIndex] = []  # written
-        # Lengths of the chunks that a continued file contains.
-        self._kept_lengths = deque(self._read_kept_lengths())
-        self._kept_count = len(self._kept_lengths)
         self._attachments: list[AttachmentIndex] = []
         self._metadata: list[MetadataIndex] = []
         self._file.put(MAGIC)
         self._file.put(encoded(Header("ros2", f"mlbatch {mlbatch.__version__}")))
-        # What the system has; ends of later chunks, and the CRC-32 up to them.
-        self._handed = Written(0, self._file.position_bytes, self._file.crc)
-        self._waiting_ends: deque[tuple[int, int]] = deque()
 
     # -- messages -----------------------------------------------------------------------------
 
@@ -242,18 +229,6 @@ class McapContainer:
 
     # -- chunks -------------------------------------------------------------------------------
 
-    @property
-    def complete_chunks(self) -> int:
-        """Number of complete chunks, written or not: the next message is added to this chunk."""
-        return self._complete_chunks
-
-    def written(self) -> Written:
-        """Return the chunks that the system has."""
-        handed_bytes = self._file.handed_bytes
-        while self._waiting_ends and self._waiting_ends[0][0] <= handed_bytes:
-            self._handed = Written(self._handed.chunks + 1, *self._waiting_ends.popleft())
-        return self._handed
-
     def take_chunks(self) -> list[Chunk]:
         """Return the chunks completed since the last call, to be compressed and written."""
         chunks = self._pending
@@ -276,16 +251,12 @@ class McapContainer:
         first_ns, last_ns = chunk.span_ns
         name = self._compression.encode()
         head_size = _CHUNK.size + len(name) + _SIZE.size
-        if chunk.is_kept:
-            self._file.skip(self._kept_lengths.popleft())
-            stored_bytes = self._file.position_bytes - start - head_size
-        else:
-            stored_bytes = sum(map(len, chunk.stored))
-            length = head_size - _RECORD_HEAD + stored_bytes
-            head = _CHUNK.pack(Opcode.CHUNK, length, first_ns, last_ns, size, chunk.crc, len(name))
-            head += name + _SIZE.pack(stored_bytes)
-            crc = joined_crc(crc32(head, 0), chunk.stored_crc, stored_bytes)
-            self._file.put(head, *chunk.stored, crc=crc)
+        stored_bytes = sum(map(len, chunk.stored))
+        length = head_size - _RECORD_HEAD + stored_bytes
+        head = _CHUNK.pack(Opcode.CHUNK, length, first_ns, last_ns, size, chunk.crc, len(name))
+        head += name + _SIZE.pack(stored_bytes)
+        crc = joined_crc(crc32(head, 0), chunk.stored_crc, stored_bytes)
+        self._file.put(head, *chunk.stored, crc=crc)
         index_start = self._file.position_bytes
         index = b""
         offsets = {}
@@ -310,7 +281,6 @@ class McapContainer:
                 uncompressed_size=size,
             )
         )
-        self._waiting_ends.append((self._file.position_bytes, self._file.crc))
 
     def end_chunk(self) -> None:
         """Complete the chunk under construction: no message follows."""
@@ -320,11 +290,9 @@ class McapContainer:
         """Complete the chunk under construction; tail: its last bytes, of this CRC-32 if known."""
         if not self._index:
             return
-        is_kept = self._complete_chunks < self._kept_count
-        self._pending.append(Chunk(self, [self._records, tail], self._index, is_kept, crc))
+        self._pending.append(Chunk(self, [self._records, tail], self._index, crc))
         self._records = bytearray()
         self._index = {}
-        self._complete_chunks += 1
 
     def _write_all_chunks(self) -> None:
         """Complete and write all chunks."""
@@ -332,22 +300,6 @@ class McapContainer:
         for chunk in self.take_chunks():
             chunk.compress()
             chunk.write()
-
-    def _read_kept_lengths(self) -> Iterable[int]:
-        """Yield the lengths of the chunks in the kept part of a continued file."""
-        position = len(MAGIC)
-        end = self._file.kept_bytes
-        while position < end:
-            head = self._file.look_at(position, _RECORD.size)
-            opcode, length = _RECORD.unpack(head) if len(head) == _RECORD.size else (0, end)
-            position += _RECORD.size + length
-            if opcode == Opcode.CHUNK:
-                yield _RECORD.size + length
-        if end and position != end:
-            raise ExportError(
-                f"{self._file.path}: expected the chunks of the interrupted run, found other "
-                "bytes; leave out --resume to start over"
-            )
 
     # -- end of the file ----------------------------------------------------------------------
 
@@ -361,15 +313,15 @@ class McapContainer:
         self._write_attachment(SCANS_CSV, "text/csv", log_ns, summary.scans_csv)
         self._complete()
 
-    def finish_piece(self, grid: dict[str, str]) -> tuple[int, int]:
-        """Complete and close one of several files of a run; returns its bytes and their CRC-32.
+    def finish_piece(self, grid: dict[str, str]) -> int:
+        """Complete and close one of several files of a run; returns its CRC-32.
 
         Report and scans.csv are of the whole run: they are not in it.
         """
         self._write_all_chunks()
         self._write_metadata("mlbatch.grid", grid)
         self._complete()
-        return self._file.position_bytes, self._file.crc
+        return self._file.crc
 
     def _complete(self) -> None:
         self._write_summary()

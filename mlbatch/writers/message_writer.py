@@ -7,8 +7,7 @@ The fields of the messages: docs/sources/messages.md and docs/sources/outputs.md
 from __future__ import annotations
 
 import json
-import math
-from collections import Counter, deque
+from collections import Counter
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Protocol, TypeAlias
@@ -31,7 +30,7 @@ from mlbatch.types import (
     instant_ns,
 )
 from mlbatch.writers.atomic import SCANS_CSV, export_errors, prepare, side_path, write_text
-from mlbatch.writers.base import Checkpoint, ScanJob, WriterOptions, Written
+from mlbatch.writers.base import ScanJob, WriterOptions
 from mlbatch.writers.output_file import borrow, crc32
 from mlbatch.writers.point_layouts import CLOUD_LAYOUTS, Layout, ScanRecords
 
@@ -62,15 +61,6 @@ class PendingChunk(Protocol):
 
 class MessageFile(Protocol):
     """A container of messages under construction; it collects messages to chunks."""
-
-    @property
-    def complete_chunks(self) -> int:
-        """Number of complete chunks, written or not: the next message is added to this chunk."""
-        ...
-
-    def written(self) -> Written:
-        """Return the chunks that the system has."""
-        ...
 
     def take_chunks(self) -> Sequence[PendingChunk]:
         """Return the chunks completed since the last call; none if they are written at once."""
@@ -105,8 +95,7 @@ class MessageFile(Protocol):
 
 
 NewWire: TypeAlias = Callable[[], Wire]
-# Path, the bytes to keep of an existing file, None: create a new one, and their CRC-32.
-OpenFile: TypeAlias = Callable[[Path, int | None, int], MessageFile]
+OpenFile: TypeAlias = Callable[[Path], MessageFile]
 
 
 def extras_of(options: WriterOptions, *encodings: str) -> frozenset[str]:
@@ -149,7 +138,7 @@ class MessageWriter:
         # Before anything is created, as it may be refused.
         self._layout = _layout_of(options)
         _refuse_same_frames(target, info)
-        keep = options.kept_bytes is not None
+        keep = options.files is not None and options.files.is_continued
         self._output = prepare(target, options.overwrite, folder, keep, options.fsync)
         self._info = info
         self._wire = wire
@@ -158,9 +147,6 @@ class MessageWriter:
         self._waiting_samples = 0
         self._waiting_bytes = 0
         self._begun = False
-        # For each scan that is not in a written chunk: the number of its chunk.
-        self._chunk_of_scan: deque[int] = deque()
-        self._written_scans = 0
         self._topics: dict[int | None, str] = {None: "/points"}
         if options.split:
             for number, sensor in enumerate(info.sensors):
@@ -168,27 +154,15 @@ class MessageWriter:
         imu = (f"/{sensor.name}/imu" for sensor in info.sensors)
         self._own = frozenset({TF_STATIC, *self._topics.values(), *imu})
         with export_errors(self._output.partial):
-            self._file = opener(self._output.partial, options.kept_bytes, options.kept_crc)
+            self._file = opener(self._output.partial)
 
     def write(self, scan: Scan, sensor: int | None = None) -> ScanJob:
         """Return the job that writes a scan as a PointCloud2, after messages that wait for it."""
-        return _CloudJob(self, scan, sensor, is_kept=False)
-
-    def skip(self, scan: Scan, sensor: int | None = None) -> ScanJob:
-        """Return the job that sends a message as long as the scan: the kept file contains it."""
-        return _CloudJob(self, scan, sensor, is_kept=True)
+        return _CloudJob(self, scan, sensor)
 
     def flush(self) -> ScanJob:
         """Return the job that writes complete chunks."""
         return ChunkJob(self._file, self._output.partial)
-
-    def checkpoint(self) -> Checkpoint:
-        """Return the scans in written chunks."""
-        written = self._file.written()
-        while self._chunk_of_scan and self._chunk_of_scan[0] < written.chunks:
-            self._chunk_of_scan.popleft()
-            self._written_scans += 1
-        return Checkpoint(self._written_scans, written.kept_bytes, written.kept_crc)
 
     def write_imu(self, samples: ImuSamples) -> None:
         """Write IMU samples at their own timestamps."""
@@ -222,20 +196,14 @@ class MessageWriter:
     def abandon(self) -> None:
         """Close the file; it has no index and stays under `.partial`."""
         self._file.abandon()
+        self._output.close()
 
     # -- for the stages of jobs ---------------------------------------------------------------
 
-    def pack_scan(self, scan: Scan, is_kept: bool) -> tuple[CloudMessage, memoryview]:
-        """Return the message of a scan and the buffer that contains it. Any thread.
-
-        is_kept: only the length of the message is used.
-        """
+    def pack_scan(self, scan: Scan) -> tuple[CloudMessage, memoryview]:
+        """Return the message of a scan and the buffer that contains it. Any thread."""
         dense = scan.info.layout != "organized"
         cloud = borrow(self.idle, self._new_cloud)
-        if is_kept:
-            columns = len(scan.column_stamp_ns)
-            shape = (scan.points,) if dense else (scan.time_ns.shape[1], columns)
-            return cloud, cloud.blank(shape, stamp_ns(scan))
         return cloud, cloud.message(scan, stamp_ns(scan), dense)
 
     def send_scan(
@@ -248,10 +216,9 @@ class MessageWriter:
             self._file.send(topic, "sensor_msgs/PointCloud2", stamp_ns(scan), message, crc=crc)
 
     def place_scan(self, scan: Scan) -> None:
-        """Write what precedes a scan, note the chunk that it is in. In order."""
+        """Write what precedes a scan. In order."""
         with export_errors(self._output.partial):
             self._begin(stamp_ns(scan))
-            self._chunk_of_scan.append(self._file.complete_chunks)
 
     # -- messages -----------------------------------------------------------------------------
 
@@ -345,19 +312,15 @@ class ChunkJob(ScanJob):
 class _CloudJob(ScanJob):
     """Writes one scan, and the chunks that are complete with it."""
 
-    def __init__(
-        self, writer: MessageWriter, scan: Scan, sensor: int | None, is_kept: bool
-    ) -> None:
+    def __init__(self, writer: MessageWriter, scan: Scan, sensor: int | None) -> None:
         self._writer = writer
         self._scan = scan
         self._sensor = sensor
-        self._is_kept = is_kept
         self._chunks = writer.flush()
 
     def pack(self) -> None:
-        self._cloud, self._message = self._writer.pack_scan(self._scan, self._is_kept)
-        if not self._is_kept:
-            self.checksum = crc32(self._message, 0)
+        self._cloud, self._message = self._writer.pack_scan(self._scan)
+        self.checksum = crc32(self._message, 0)
 
     def start(self, index: int) -> None:
         self._chunks.start(index)
@@ -382,7 +345,6 @@ class CloudMessage:
         self._frame_id = frame_id
         self._wire = wire
         self._records = ScanRecords(layout)
-        self._blank = np.empty(0, dtype=np.uint8)
 
     def message(self, scan: Scan, stamp_ns: int, dense: bool) -> memoryview:
         """Return the message of a scan, in the buffer of its records: valid as long as that is."""
@@ -397,13 +359,6 @@ class CloudMessage:
         buffer[start : packed.begin] = np.frombuffer(head, dtype=np.uint8)
         buffer[packed.end] = dense
         return buffer[start : packed.end + 1].data
-
-    def blank(self, shape: tuple[int, ...], stamp_ns: int) -> memoryview:
-        """Return bytes as long as the message of a cloud of this shape, with any content."""
-        total = len(self._head(shape, stamp_ns)) + math.prod(shape) * self._layout.step + 1
-        if len(self._blank) < total:
-            self._blank = np.zeros(total * 5 // 4, dtype=np.uint8)
-        return self._blank[:total].data
 
     def _head(self, shape: tuple[int, ...], stamp_ns: int) -> bytearray:
         """Return the message up to its points; shape: (width,) or (height, width)."""

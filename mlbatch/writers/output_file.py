@@ -1,9 +1,4 @@
-"""Output files written in order: gathered writes, checksums, page cache, continued files.
-
-Continuing a file needs no code that knows its content. A writer that is given the same scans and
-messages produces the same bytes and index again; so a resumed run repeats all writing, with
-scans of the right size and without points, and the files here drop the bytes that are on the disk.
-"""
+"""Output files written in order: gathered writes, checksums, page cache."""
 
 from __future__ import annotations
 
@@ -16,9 +11,8 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from functools import lru_cache
 from pathlib import Path
-from typing import IO, TypeAlias, TypeVar, cast
+from typing import TypeAlias, TypeVar, cast
 
-from mlbatch.errors import ExportError
 from mlbatch.writers.direct_writes import DirectWrites
 
 Bytes: TypeAlias = bytes | bytearray | memoryview  # views have items of one byte
@@ -89,14 +83,12 @@ def _product(one: int, other: int) -> int:
     return product
 
 
-def file_crc(path: Path, size: int | None = None) -> int:
-    """Return the CRC-32 of a file, or of its first `size` bytes."""
+def file_crc(path: Path) -> int:
+    """Return the CRC-32 of a file."""
     crc = 0
     with path.open("rb", buffering=0) as file:
-        left = os.fstat(file.fileno()).st_size if size is None else size
-        while left and (piece := file.read(min(left, _PIECE_BYTES))):
+        while piece := file.read(_PIECE_BYTES):
             crc = crc32(piece, crc)
-            left -= len(piece)
     return crc
 
 
@@ -161,37 +153,22 @@ class WriteBehind:
 
 
 class OutputFile:
-    """A large file, unbuffered; skips the bytes that a continued file already contains.
+    """A large file, unbuffered.
 
     From its first `_DROP_BYTES` on it is written past the page cache where the system can.
-    kept_bytes: length of the part that a continued file keeps, 0 for a new file;
-    position_bytes: of the next byte, written or skipped; crc: CRC-32 of what is before it, in the
-    kept part 0 until its end.
+    position_bytes: of the next byte; crc: CRC-32 of what is before it.
     """
 
-    def __init__(self, path: Path, kept_bytes: int | None, kept_crc: int = 0) -> None:
-        """kept_bytes: part of an existing file to keep, and its CRC-32; None: create a new file."""
-        self.path = path
-        self.kept_bytes = kept_bytes or 0
+    def __init__(self, path: Path) -> None:
         self.crc = 0
-        self._kept_crc = kept_crc
         self.position_bytes = 0
         self._dropped_bytes = 0
         self._direct: DirectWrites | None = None
-        self._file = io.FileIO(path, "w+" if kept_bytes is None else "r+")
-        if kept_bytes is not None:
-            _truncate(self._file, path, kept_bytes, kept_crc)
-
-    def look_at(self, position: int, count: int) -> bytes:
-        """Return up to `count` bytes of the file at any position."""
-        return os.pread(self._file.fileno(), count, position)
+        self._file = io.FileIO(path, "w+")
 
     def put(self, *parts: Bytes, crc: int | None = None) -> None:
-        """Append parts, of a known CRC-32 or not; the end of the kept bytes must not be inside."""
+        """Append parts, of a known CRC-32 or not."""
         size = sum(map(len, parts))
-        if self.position_bytes < self.kept_bytes:
-            self.skip(size)
-            return
         if crc is not None:
             self.crc = joined_crc(self.crc, crc, size)
         else:
@@ -211,19 +188,6 @@ class OutputFile:
                 direct = DirectWrites(self._file.fileno(), self.position_bytes)
                 self._direct = direct if direct.is_direct else None
 
-    @property
-    def handed_bytes(self) -> int:
-        """Bytes from the start that the system has."""
-        return self.position_bytes if self._direct is None else self._direct.handed_bytes
-
-    def skip(self, size: int) -> None:
-        """Advance over kept bytes."""
-        self.position_bytes += size
-        if self.position_bytes > self.kept_bytes:
-            raise _not_as_before(self.path)
-        if self.position_bytes == self.kept_bytes:
-            self.crc = self._kept_crc
-
     def complete(self) -> None:
         """Hand the rest to the system and close the file."""
         if self._direct is not None:
@@ -233,79 +197,3 @@ class OutputFile:
     def close(self) -> None:
         """Close the file; what was not handed to the system is lost."""
         self._file.close()
-
-
-class BufferedFile:
-    """A file with the methods that a library calls which writes in order; see `OutputFile`.
-
-    Drops the first `kept_bytes` that are written; positions include them. crc: CRC-32 of all bytes
-    but overwritten ones.
-    """
-
-    def __init__(self, path: Path, kept_bytes: int | None, kept_crc: int = 0) -> None:
-        """kept_bytes: part of an existing file to keep, and its CRC-32; None: create a new file."""
-        self.crc = kept_crc
-        self._path = path
-        self._left = kept_bytes or 0
-        self._file = path.open("wb" if kept_bytes is None else "r+b")
-        if kept_bytes is not None:
-            _truncate(self._file, path, kept_bytes, kept_crc)
-
-    def write(self, data: Bytes) -> int:
-        """Write what follows the kept bytes; their end must not be inside `data`."""
-        if not self._left:
-            self.crc = crc32(data, self.crc)
-            return self._file.write(data)
-        size = memoryview(data).nbytes
-        if size > self._left:
-            raise _not_as_before(self._path)
-        self._left -= size
-        return size
-
-    def tell(self) -> int:
-        """Return the position that an uninterrupted run would have."""
-        return self._file.tell() - self._left
-
-    def seek(self, offset: int) -> int:
-        """Move to a byte to overwrite."""
-        return self._file.seek(offset)
-
-    def flush(self) -> None:
-        """Hand what was written to the system."""
-        self._file.flush()
-
-    def close(self) -> None:
-        """Close the file."""
-        self._file.close()
-
-
-def _truncate(file: IO[bytes], path: Path, kept_bytes: int, kept_crc: int) -> None:
-    """Check and cut a file that is open for reading and writing, and move to its end."""
-    size = file.seek(0, io.SEEK_END)
-    if size < kept_bytes:
-        file.close()
-        raise ExportError(
-            f"{path}: expected {kept_bytes} bytes of the interrupted run, found {size}; leave out "
-            "--resume to start over"
-        )
-    if file_crc(path, kept_bytes) != kept_crc:
-        file.close()
-        raise changed_bytes(path)
-    file.truncate(kept_bytes)
-    file.seek(kept_bytes)
-
-
-def changed_bytes(path: Path) -> ExportError:
-    """Return the error about an output that was changed after it was written."""
-    return ExportError(
-        f"{path}: expected the bytes that the interrupted run has written, found others; leave out "
-        "--resume to start over"
-    )
-
-
-def _not_as_before(path: Path) -> ExportError:
-    """Return the error about data whose pieces end elsewhere than in the interrupted run."""
-    return ExportError(
-        f"{path}: expected the scans of the interrupted run, found others; leave out --resume to "
-        "start over"
-    )

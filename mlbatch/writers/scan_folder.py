@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
-from mlbatch.errors import ExportError, UsageError
+from mlbatch.errors import UsageError
 from mlbatch.types import ImuSamples, Message, RunInfo, Scan, Summary
 from mlbatch.writers.atomic import SCANS_CSV, export_errors, prepare
 from mlbatch.writers.base import (
     CHECKSUMS,
     DEFAULT_POINT_LAYOUT,
-    Checkpoint,
     ScanJob,
     WriterOptions,
 )
@@ -21,9 +20,7 @@ from mlbatch.writers.output_file import (
     Bytes,
     WriteBehind,
     borrow,
-    changed_bytes,
     drop_from_cache,
-    file_crc,
     write_summed,
 )
 
@@ -50,13 +47,11 @@ def check_dense(name: str, info: RunInfo) -> None:
         )
 
 
-def checksum_of(paths: Iterable[Path]) -> int:
-    """Return the checksum of a scan from its files, see `ScanJob`; ExportError for other files."""
-    crcs = []
-    for path in paths:
-        with export_errors(path):
-            crcs.append(file_crc(path))
-    return sum(crcs) % CHECKSUMS
+class Written(NamedTuple):
+    """A file as it was written."""
+
+    size: int
+    crc: int  # CRC-32
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,7 +88,7 @@ class FolderWriter:
                 f"--point-layout: expected {DEFAULT_POINT_LAYOUT} for {name}, found "
                 f"{options.point_layout}; write a .mcap, since presets are fields of PointCloud2"
             )
-        keep = options.kept_bytes is not None
+        keep = options.files is not None and options.files.is_continued
         self._output = prepare(
             target, options.overwrite, folder=True, keep=keep, fsync=options.fsync
         )
@@ -101,7 +96,7 @@ class FolderWriter:
         self._idle: dict[str, list[Encoder]] = {suffix: [] for suffix in self._encoders}
         self._lists = dict(lists or {})
         self._entries: dict[int | None, list[Entry]] = {}
-        self._committed = 0
+        self._files = options.files
         self._behind = WriteBehind()
         self._folders: dict[int | None, Path] = {None: self._output.partial}
         if options.split:
@@ -109,23 +104,16 @@ class FolderWriter:
 
     def write(self, scan: Scan, sensor: int | None = None) -> ScanJob:
         """Return the job that writes a scan to a file of its own."""
-        return _SaveJob(self, scan, self._paths(scan, sensor))
+        return _SaveJob(self, scan, sensor, self._paths(scan, sensor))
 
     def skip(self, scan: Scan, sensor: int | None = None) -> ScanJob:
-        """Return the job that keeps the file of a scan."""
-        return _KeepJob(self, self._paths(scan, sensor))
-
-    def pass_over(self, scan: Scan) -> ScanJob:
-        """Return the job of a scan that another shard writes: it has no file here."""
-        return _KeepJob(self, {})
+        """Return a job without work: another run has made the file, or makes it."""
+        self._paths(scan, sensor)
+        return ScanJob()
 
     def flush(self) -> ScanJob:
         """Return a job without work: only scans are written."""
         return ScanJob()
-
-    def checkpoint(self) -> Checkpoint:
-        """Return the scans whose files are closed."""
-        return Checkpoint(self._committed)
 
     def write_imu(self, samples: ImuSamples) -> None:
         """Ignore IMU samples."""
@@ -144,62 +132,42 @@ class FolderWriter:
         path = self._output.partial / SCANS_CSV
         with export_errors(path):
             path.write_text(summary.scans_csv, encoding="utf-8", newline="\n")
-        self.finish_part(last)
-
-    def finish_part(self, last: Callable[[Path], None] | None = None) -> None:
-        """Move the folder to its final path with the files of scans alone; last: as in `finish`."""
         self._output.sync()
         if last is not None:
             last(self._output.partial)
         self._output.publish()
 
     def abandon(self) -> None:
-        """Do nothing: no file is open between jobs."""
+        """Leave the folder under construction to other runs."""
+        self._output.close()
 
-    def save(self, scan: Scan, paths: Mapping[str, Path]) -> tuple[dict[Path, int], int]:
-        """Write the files of a scan; returns their sizes in bytes and checksum. Any thread."""
-        sizes = {}
-        crcs = []
+    def save(self, scan: Scan, paths: Mapping[str, Path]) -> dict[Path, Written]:
+        """Write the files of a scan. Any thread."""
+        written = {}
         for suffix, path in paths.items():
             idle = self._idle[suffix]
             encoder = borrow(idle, self._encoders[suffix])
             with export_errors(path), path.open("wb", buffering=0) as file:
-                crcs.append(write_summed(file, encoder.encode(scan)))
-                sizes[path] = file.tell()
-                drop_from_cache(file.fileno(), 0, sizes[path])
+                crc = write_summed(file, encoder.encode(scan))
+                written[path] = Written(file.tell(), crc)
+                drop_from_cache(file.fileno(), 0, written[path].size)
             idle.append(encoder)
-        return sizes, sum(crcs) % CHECKSUMS
+        return written
 
-    def count(self, sizes: Mapping[Path, int]) -> None:
-        """Count the files of a scan as complete; sizes: bytes to drop from the cache. In order."""
-        self._committed += 1
-        for path, size in sizes.items():
-            self._behind.add(path, size)
+    def made(self, scan: Scan, sensor: int | None, written: Mapping[Path, Written]) -> None:
+        """Note the files of a scan, which are whole. In order."""
+        for path, file in written.items():
+            self._behind.add(path, file.size)
+        if self._files is not None:
+            folder = self._output.partial
+            crcs = {path.relative_to(folder).as_posix(): file.crc for path, file in written.items()}
+            self._files.made(crcs, scan.index, scan.slice, sensor)
 
     def _paths(self, scan: Scan, sensor: int | None) -> dict[str, Path]:
         """Return the files of a scan by suffix, and note it for the lists."""
         if self._lists:
             key = (scan.index < 0, scan.index, scan.slice)
             self._entries.setdefault(sensor, []).append(Entry(key, scan.start_ns))
-        return self.files(scan, sensor)
-
-    @property
-    def bag_files(self) -> int:
-        """Return 0: every scan has files of its own."""
-        return 0
-
-    @property
-    def checksums(self) -> dict[str, int]:
-        """Return nothing: no file has several scans."""
-        return {}
-
-    @property
-    def folder(self) -> Path:
-        """The folder under construction."""
-        return self._output.partial
-
-    def files(self, scan: Scan, sensor: int | None) -> dict[str, Path]:
-        """Return the files of a scan by suffix, in the folder under construction."""
         stem = scan_name(scan.index, scan.slice, scan.slices)
         folder = self._folders[sensor]
         return {suffix: folder / f"{stem}.{suffix}" for suffix in self._encoders}
@@ -217,39 +185,18 @@ class FolderWriter:
 class _SaveJob(ScanJob):
     """Writes the files of one scan; scans are independent, so any thread may do all of it."""
 
-    def __init__(self, writer: FolderWriter, scan: Scan, paths: Mapping[str, Path]) -> None:
+    def __init__(
+        self, writer: FolderWriter, scan: Scan, sensor: int | None, paths: Mapping[str, Path]
+    ) -> None:
         self._writer = writer
         self._scan = scan
+        self._sensor = sensor
         self._paths = paths
-        self._sizes: dict[Path, int] = {}
+        self._written: Mapping[Path, Written] = {}
 
     def pack(self) -> None:
-        self._sizes, self.checksum = self._writer.save(self._scan, self._paths)
+        self._written = self._writer.save(self._scan, self._paths)
+        self.checksum = sum(file.crc for file in self._written.values()) % CHECKSUMS
 
     def commit(self) -> None:
-        self._writer.count(self._sizes)
-
-
-class _KeepJob(ScanJob):
-    """Keeps the files of one scan that the interrupted run has written."""
-
-    def __init__(self, writer: FolderWriter, paths: Mapping[str, Path]) -> None:
-        self._writer = writer
-        self._paths = paths
-
-    def pack(self) -> None:
-        paths = list(self._paths.values())
-        # Of those that are missing `commit` says so.
-        if self.checksum is None or not all(path.is_file() for path in paths):
-            return
-        if checksum_of(paths) != self.checksum:
-            raise changed_bytes(paths[0])
-
-    def commit(self) -> None:
-        for path in self._paths.values():
-            if not path.is_file():
-                raise ExportError(
-                    f"{path}: expected a scan of the interrupted run, found no file; leave out "
-                    "--resume to start over"
-                )
-        self._writer.count({})
+        self._writer.made(self._scan, self._sensor, self._written)

@@ -67,7 +67,7 @@ class Driver:
         scans = 0
         for window in batcher.push(ingested.arrivals, batch.host_ns):
             self._pool = self._pool or self.run.pool
-            for task in self._pool.tasks(window, iter(())):
+            for task in self._pool.tasks(window):
                 self._pool.workers[0].decode(task)
                 scans += 1
         return scans

@@ -36,7 +36,7 @@ from mlbatch.types import (
     StreamTable,
     Summary,
 )
-from mlbatch.writers import Checkpoint, ScanJob, ScanWriter, WriterOptions, extras, open_writer
+from mlbatch.writers import ScanJob, ScanWriter, WriterOptions, extras, open_writer
 from tests.builders.parser import parser
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -103,17 +103,9 @@ class Memory:
         """Copy a scan, in order."""
         self.scans.append((deepcopy(scan), sensor))
 
-    def skip(self, scan: Scan, sensor: int | None = None) -> ScanJob:
-        """Nothing: what is in memory is never continued."""
-        return ScanJob()
-
     def flush(self) -> ScanJob:
         """Nothing: all is kept at once."""
         return ScanJob()
-
-    def checkpoint(self) -> Checkpoint:
-        """Nothing: see above."""
-        return Checkpoint(0)
 
     def write_imu(self, samples: ImuSamples) -> None:
         """Keep IMU samples."""

@@ -17,7 +17,6 @@ import numpy.typing as npt
 import pytest
 
 from mlbatch.cli import app, main
-from mlbatch.pipeline import resume, state_file
 from mlbatch.writers import atomic
 from tests.builders.captures import udp_frame, write_pcap
 from tests.builders.ouster import OusterSpec, encode_frame, imu_packet, metadata_json
@@ -150,11 +149,9 @@ class Shell:
 def recording_shell(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], folder: Path
 ) -> Shell:
-    """The command line, in a folder; every scan gets a line of the state file, without syncs."""
+    """The command line, in a folder, without syncs."""
     monkeypatch.chdir(folder)
-    monkeypatch.setattr(resume, "INTERVAL_S", 0.0)
-    for module in (state_file, atomic):
-        monkeypatch.setattr(module, "sync_to_disk", lambda path: None)
+    monkeypatch.setattr(atomic, "sync_to_disk", lambda path: None)
     return Shell(monkeypatch, capsys)
 
 

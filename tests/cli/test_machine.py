@@ -136,8 +136,8 @@ def test_the_account_of_a_shard_nested_too_deeply(shell: Shell) -> None:
 # -- disks ------------------------------------------------------------------------------------
 
 WRITTEN = {
-    "mcap": (f"convert {PAIR} -o ro/x.mcap", "ro/x.mcap.partial.state"),
-    "folder": (f"convert {PAIR} -o ro/x", "ro/x.partial.state"),
+    "mcap": (f"convert {PAIR} -o ro/x.mcap", "ro/x.mcap.partial"),
+    "folder": (f"convert {PAIR} -o ro/x", "ro/x.partial"),
     "report": (f"convert {PAIR} --dry-run --report ro/r.json", "ro/r.json"),
     "page": (f"convert {PAIR} --dry-run --html ro/r.html", "ro/r.html"),
     "page of an output": ("report out -o ro/r.html", "ro/r.html"),

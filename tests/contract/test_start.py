@@ -56,7 +56,7 @@ NEEDLESS = (
     *("mlbatch.sensors.ouster.simulate", "mlbatch.lidar.simulated"),
     *("mlbatch.cli.batch", "mlbatch.cli.convert_remote", "mlbatch.batch.task"),
     *("mlbatch.cli.digest", "mlbatch.digest.golden"),
-    *("mlbatch.pipeline.deskew", "mlbatch.motion.se3", "mlbatch.pipeline.shard_part"),
+    *("mlbatch.pipeline.deskew", "mlbatch.motion.se3", "mlbatch.pipeline.merge"),
     *("mlbatch.batching.fusion", "mlbatch.batching.sweeps", "mlbatch.pipeline.shards"),
     *("numpy.ma", "rosbags", "rich", "mcap.writer", "importlib.metadata"),
     *("mlbatch.readers.capture.odd", "dpkt"),

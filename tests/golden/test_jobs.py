@@ -185,9 +185,7 @@ def test_the_earliest_failed_scan_is_reported(
 SLOW = """
 import sys, time
 from mlbatch import cli
-from mlbatch.pipeline import resume
 from mlbatch.writers.formats import npz
-resume.INTERVAL_S = 0.0
 encode = npz.NpzEncoder.encode
 def slow(*given):
     time.sleep(0.2)

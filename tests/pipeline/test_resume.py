@@ -20,9 +20,10 @@ import pytest
 import mlbatch
 from mlbatch.cli import run
 from mlbatch.errors import ExportError, RecordingError
-from mlbatch.pipeline import job_identity, resume, state_file, workers
+from mlbatch.pipeline import files, job_identity, workers
 from mlbatch.readers import source
 from mlbatch.types import Scan
+from mlbatch.writers import atomic
 from mlbatch.writers.formats import npz
 from mlbatch.writers.output_file import Bytes
 from tests.builders.sessions import FIXTURE, SMALL, Shell, Unit, recording_shell, write_session
@@ -31,14 +32,14 @@ from tests.resume_storm import contents, write_recordings
 CAPTURE = f"{FIXTURE / 'two_lidars.pcap'} --rig {FIXTURE / 'rig.yaml'}"
 # From fixtures/two_lidars/SOURCE.md: a window of 10 Hz each.
 SCANS = 7
-STATE = Path("out.partial.state")
+JOURNAL = Path("out.partial/files.jsonl")
 
 
 @pytest.fixture
 def shell(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> Shell:
-    """The command line, in an empty folder; every scan gets a line of the state file."""
+    """The command line, in an empty folder."""
     return recording_shell(monkeypatch, capsys, tmp_path)
 
 
@@ -58,16 +59,11 @@ def _fail_at(monkeypatch: pytest.MonkeyPatch, scan: int, error: BaseException) -
 
 
 def _interrupt(shell: Shell, words: str = f"{CAPTURE} -o out") -> None:
-    """Leave a `.partial` with three scans that are safe."""
+    """Leave a `.partial` with three scans that are whole."""
     with pytest.MonkeyPatch.context() as patch:
         _fail_at(patch, 3, KeyboardInterrupt())
         assert shell(f"convert {words}").code == 130
-    assert STATE.is_file()
-
-
-def _records(state: Path) -> list[dict[str, Any]]:
-    """Content of a state file, without checksums."""
-    return [json.loads(line.partition(" ")[2]) for line in state.read_text().splitlines()]
+    assert len(JOURNAL.read_bytes().splitlines()) == 4
 
 
 def _whole(shell: Shell, words: str = CAPTURE) -> dict[str, object]:
@@ -98,6 +94,15 @@ def test_it_continues_after_the_scans_that_are_safe(
     assert contents(Path()) == whole
 
 
+def test_the_head_and_slices_are_not_made_again(shell: Shell) -> None:
+    words = f"{CAPTURE} --keep-partial --slices 2"
+    whole = _whole(shell, words)
+    _interrupt(shell, f"{words} -o out")
+    outcome = shell(f"convert {words} -o out --resume")
+    assert outcome.err == "mlbatch: out: resumed after 3 scans\n"
+    assert contents(Path()) == whole
+
+
 def test_an_interrupt_names_resume(shell: Shell, monkeypatch: pytest.MonkeyPatch) -> None:
     _fail_at(monkeypatch, 2, KeyboardInterrupt())
     outcome = shell(f"convert {CAPTURE} -o out")
@@ -122,7 +127,8 @@ def test_a_request_to_end_is_an_interrupt(
     monkeypatch.setattr(npz.NpzEncoder, "encode", ending)
     assert shell(f"convert {CAPTURE} -o out").code == 130
     assert signal.signal(number, before) is signal.SIG_DFL
-    assert _records(STATE)[-1] == {"synced": True}
+    # Other threads complete what they have begun.
+    assert len(JOURNAL.read_bytes().splitlines()) >= 2
 
 
 def test_nohup_outlives_its_terminal(shell: Shell, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -141,13 +147,19 @@ def test_nohup_outlives_its_terminal(shell: Shell, monkeypatch: pytest.MonkeyPat
 def test_an_interrupt_after_the_last_rename_leaves_the_output_alone(
     shell: Shell, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def ending(log: resume.ResumeLog) -> None:
+    def ending(target: Path, fsync: bool) -> None:
         raise KeyboardInterrupt
 
     whole = _whole(shell)
-    monkeypatch.setattr(resume.ResumeLog, "remove", ending)
-    outcome = shell(f"convert {CAPTURE} -o out")
+    with monkeypatch.context() as patch:
+        patch.setattr(atomic, "tidy", ending)
+        outcome = shell(f"convert {CAPTURE} -o out")
     assert (outcome.code, outcome.err) == (130, "mlbatch: error: interrupted\n")
+    assert [path.name for path in Path().iterdir() if path.name != "whole"] == ["out"]
+    assert shell("verify out").code == 0
+    # The list of files under construction is all that is too many.
+    assert contents(Path()).keys() - whole.keys() == {"out/files.jsonl"}
+    assert "is complete" in shell(f"convert {CAPTURE} -o out --resume").err
     assert contents(Path()) == whole
 
 
@@ -194,19 +206,19 @@ class _Ending:
 def test_an_interrupt_in_a_finalizer_is_not_lost(
     shell: Shell, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    take = resume.ResumeLog.take
+    take = files.Files.take
     calls = 0
 
-    def ending(log: resume.ResumeLog, *given: Any) -> state_file.FinishedScan | None:
+    def ending(own: files.Files, *given: Any) -> files.FinishedScan | None:
         nonlocal calls
         calls += 1
         if calls == 2:
             _Ending()
         if calls == 3:
             time.sleep(0.2)
-        return take(log, *given)
+        return take(own, *given)
 
-    monkeypatch.setattr(resume.ResumeLog, "take", ending)
+    monkeypatch.setattr(files.Files, "take", ending)
     outcome = shell(f"convert {CAPTURE} -o out")
     assert outcome.code == 130
     assert outcome.err.startswith("mlbatch: error: interrupted")
@@ -375,7 +387,7 @@ def test_other_packets_in_finished_scans_are_refused(shell: Shell, tmp_path: Pat
     assert outcome.code == 2
     assert outcome.err.splitlines()[-1] == (
         "mlbatch: error: out.partial: expected the packets of the interrupted run, found others "
-        "for scan 2 of 3 that are finished: a recording was changed; restore it, or leave out "
+        "for a finished scan, that of window 1: a recording was changed; restore it, or leave out "
         "--resume to start over"
     )
     _flip(capture, at)
@@ -400,9 +412,10 @@ def test_other_packets_behind_finished_scans_are_converted(shell: Shell, tmp_pat
 def test_another_forwarded_message_is_refused(shell: Shell, tmp_path: Path) -> None:
     write_recordings(tmp_path / "in", 12)
     recording = tmp_path / "in" / "bag" / "drive.mcap"
-    case = f"{recording} -o out.mcap --identity-extrinsics --keep-partial --pass /chatter"
+    case = f"{recording} -o out --identity-extrinsics --keep-partial --pass /chatter"
+    case += " --format rosbag2 --max-bag-duration 0.2"
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(resume.ResumeLog, "complete", _refuse)
+        patch.setattr(files.Files, "complete", _refuse)
         assert shell(f"convert {case}").code == 1
     content = recording.read_bytes()
     at = len(content) // 10
@@ -450,84 +463,113 @@ def test_another_rig_of_the_same_time_is_refused(
     assert shell(f"convert {words} --resume").err == "mlbatch: out: resumed after 3 scans\n"
 
 
-def test_a_lost_scan_is_refused(shell: Shell) -> None:
+CHANGED = "expected the bytes that the interrupted run has written, found"
+
+
+def test_a_lost_scan_is_made_again(shell: Shell) -> None:
+    whole = _whole(shell)
     _interrupt(shell)
     Path("out.partial/000001.npz").unlink()
     outcome = shell(f"convert {CAPTURE} -o out --resume")
-    assert outcome.code == 1
-    assert outcome.err.splitlines()[-1] == (
-        "mlbatch: error: out.partial/000001.npz: expected a scan of the interrupted run, "
-        "found no file; leave out --resume to start over"
+    assert (outcome.code, outcome.err.splitlines()) == (
+        0,
+        [
+            "mlbatch: out: resumed after 3 scans",
+            f"mlbatch: out.partial/000001.npz: {CHANGED} 'No such file or directory'; made again",
+        ],
     )
+    assert contents(Path()) == whole
 
 
-@pytest.mark.parametrize("words", ["", "--split", "--format ply", "--format nuscenes"])
-def test_a_changed_byte_of_a_finished_scan_is_refused(shell: Shell, words: str) -> None:
-    words = f"{CAPTURE} -o out {words} --jobs 1"
+@pytest.mark.parametrize("jobs", ["", "--jobs 3"])
+@pytest.mark.parametrize(
+    "words",
+    [
+        "",
+        "--split",
+        "--format ply",
+        "--format nuscenes",
+        "--format rosbag2 --max-bag-duration 0.2",
+    ],
+)
+def test_a_changed_byte_of_a_finished_file_is_found(shell: Shell, words: str, jobs: str) -> None:
+    """Of each file of a scan, and of a file of a bag: it is made again, and no other."""
+    words = f"{CAPTURE} {words} {jobs}"
+    whole = _whole(shell, words)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(resume.ResumeLog, "complete", _refuse)
-        assert shell(f"convert {words}").code == 1
-    files = [path for path in sorted(Path("out.partial").rglob("000001*")) if path.is_file()]
-    for path in files:
+        patch.setattr(files.Files, "complete", _refuse)
+        assert shell(f"convert {words} -o out").code == 1
+    changed = [path for path in sorted(Path("out.partial").rglob("*1.*")) if path.suffix != ".csv"]
+    assert changed
+    times = {path: path.stat().st_mtime_ns for path in Path("out.partial").rglob("*[02].*")}
+    for path in changed:
         sound = path.read_bytes()
         path.write_bytes(sound[:-100] + bytes([sound[-100] ^ 1]) + sound[-99:])
-        outcome = shell(f"convert {words} --resume")
-        assert outcome.code == 1
-        error = outcome.err.splitlines()[-1]
-        assert error.startswith("mlbatch: error: out.partial/")
-        assert path.name.partition(".")[0] in error
-        assert "expected the bytes that the interrupted run has written, found others" in error
-        path.write_bytes(sound)
-    assert shell(f"convert {words} --resume").code == 0
+    outcome = shell(f"convert {words} -o out --resume")
+    assert outcome.code == 0
+    lines = outcome.err.splitlines()[1:]
+    # Of two files of a scan, the first says it.
+    assert lines == [
+        f"mlbatch: {path}: {CHANGED} others; made again"
+        for path in changed
+        if not path.name.endswith(".time.bin")
+    ]
+    assert contents(Path()) == whole
+    assert times
+    for path, time_ns in times.items():
+        name = path.relative_to("out.partial")
+        assert Path("out", name).stat().st_mtime_ns == time_ns
 
 
-@pytest.mark.parametrize("name", ["out.mcap", "out.mcap --compression zstd", "out.bag"])
-def test_a_changed_byte_of_a_file_is_refused(shell: Shell, tmp_path: Path, name: str) -> None:
-    spec = replace(SMALL, beams=128, columns_per_frame=512)
-    capture = write_session(tmp_path / "in", Unit(spec, turns=30))
+def test_begun_files_of_other_scans_are_removed(shell: Shell) -> None:
+    """What is not known to be whole is absent, also where this run gives no such scan."""
+    whole = _whole(shell)
+    _interrupt(shell)
+    Path("out.partial/000123.npz").write_bytes(b"half a scan")
+    Path("out.partial/left").mkdir()
+    Path("out.partial/left/000001.npz").write_bytes(b"half a scan")
+    assert shell(f"convert {CAPTURE} -o out --resume").code == 0
+    Path("out/left").rmdir()
+    assert contents(Path()) == whole
+
+
+@pytest.mark.parametrize("name", ["out.mcap", "out.bag", "out --format rosbag2"])
+def test_an_output_in_one_file_is_made_from_the_start(shell: Shell, name: str) -> None:
+    Path("whole").mkdir()
+    assert shell(f"convert {CAPTURE} -o whole/{name}").code == 0
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(resume.ResumeLog, "complete", _refuse)
-        assert shell(f"convert {capture} -o {name}").code == 1
-    partial = Path(f"{name.split()[0]}.partial")
-    kept = _records(Path(f"{partial}.state"))[-2]["kept_bytes"]
-    with partial.open("r+b") as file:
-        file.seek(kept // 2)
-        old = file.read(1)[0]
-        file.seek(-1, os.SEEK_CUR)
-        file.write(bytes([old ^ 1]))
-    outcome = shell(f"convert {capture} -o {name} --resume")
-    assert outcome.code == 1
-    assert outcome.err.splitlines()[-1] == (
-        f"mlbatch: error: {partial}: expected the bytes that the interrupted run has written, "
-        "found others; leave out --resume to start over"
-    )
+        patch.setattr(files.Files, "complete", _refuse)
+        assert shell(f"convert {CAPTURE} -o {name}").code == 1
+    outcome = shell(f"convert {CAPTURE} -o {name} --resume")
+    target = name.split()[0]
+    assert outcome.err == f"mlbatch: {target}: nothing to resume; started over\n"
+    assert contents(Path()) == contents(Path("whole"))
 
 
-def test_a_shorter_file_is_refused(shell: Shell, tmp_path: Path) -> None:
-    spec = replace(SMALL, beams=128, columns_per_frame=512)
-    capture = write_session(tmp_path / "in", Unit(spec, turns=30))
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(resume.ResumeLog, "complete", _refuse)
-        assert shell(f"convert {capture} -o out.mcap").code == 1
-    partial = Path("out.mcap.partial")
-    kept = _records(Path("out.mcap.partial.state"))[-2]["kept_bytes"]
-    os.truncate(partial, kept - 1)
-    outcome = shell(f"convert {capture} -o out.mcap --resume")
-    assert outcome.code == 1
-    assert outcome.err.splitlines()[-1] == (
-        f"mlbatch: error: out.mcap.partial: expected {kept} bytes of the interrupted run, "
-        f"found {kept - 1}; leave out --resume to start over"
-    )
+def test_the_state_of_an_earlier_version_is_one_line(shell: Shell) -> None:
+    whole = _whole(shell)
+    Path("out.partial").mkdir()
+    Path("out.partial/000000.npz").write_bytes(b"a scan")
+    Path("out.partial.state").write_text('0123456789abcdef {"schema":"mlbatch.state/3"}\n')
+    outcome = shell(f"convert {CAPTURE} -o out --resume")
+    assert outcome.code == 0
+    assert outcome.err.splitlines() == [
+        "mlbatch: out.partial.state: expected files.jsonl in out.partial, found the state file of "
+        "an earlier version of mlbatch; it is removed, and all files are made again",
+        "mlbatch: out: nothing to resume; started over",
+    ]
+    assert not Path("out.partial.state").exists()
+    assert contents(Path()) == whole
 
 
-def _refuse(log: resume.ResumeLog) -> None:
+def _refuse(own: files.Files) -> None:
     raise ExportError("stopped")
 
 
 @pytest.mark.parametrize("option", ["", "--resume"])
 def test_a_running_run_is_not_disturbed(shell: Shell, option: str) -> None:
     _interrupt(shell)
-    with STATE.open("rb") as held:
+    with JOURNAL.open("rb") as held:
         fcntl.flock(held, fcntl.LOCK_EX)
         outcome = shell(f"convert {CAPTURE} -o out {option}")
     assert outcome.code == 1
@@ -535,7 +577,7 @@ def test_a_running_run_is_not_disturbed(shell: Shell, option: str) -> None:
         "mlbatch: error: out: expected no other run that writes it, found one; wait for its end "
         "or choose another output\n"
     )
-    assert STATE.is_file()
+    assert "resumed after 3 scans" in shell(f"convert {CAPTURE} -o out --resume").err
 
 
 @pytest.mark.parametrize("output", ["out", "out.mcap"])
@@ -543,14 +585,15 @@ def test_a_run_that_began_after_the_check_is_not_disturbed(
     shell: Shell, monkeypatch: pytest.MonkeyPatch, output: str
 ) -> None:
     """Two runs may both find nothing before one of them writes."""
-    state, scan = Path(f"{output}.partial.state"), Path(f"{output}.partial")
-    with contextlib.ExitStack() as files:
+    partial = Path(f"{output}.partial")
+    lock = partial if partial.suffixes == [".mcap", ".partial"] else partial / "files.jsonl"
+    with contextlib.ExitStack() as held:
 
         def other_run(*_: object) -> None:
-            file = files.enter_context(state.open("wb", buffering=0))
+            lock.parent.mkdir(exist_ok=True)
+            file = held.enter_context(lock.open("wb", buffering=0))
             fcntl.flock(file, fcntl.LOCK_EX)
             file.write(b"what it did")
-            scan.write_bytes(b"what it wrote")
 
         monkeypatch.setattr(run, "check_target", other_run)
         outcome = shell(f"convert {CAPTURE} -o {output}")
@@ -558,11 +601,10 @@ def test_a_run_that_began_after_the_check_is_not_disturbed(
         1,
         True,
     )
-    assert state.read_bytes() == b"what it did"
-    assert scan.read_bytes() == b"what it wrote"
+    assert lock.read_bytes() == b"what it did"
 
 
-def test_an_output_that_cannot_be_opened_leaves_no_state(
+def test_an_output_that_cannot_be_opened_leaves_nothing(
     shell: Shell, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def refuse(*_: object) -> None:
@@ -574,132 +616,117 @@ def test_an_output_that_cannot_be_opened_leaves_no_state(
     assert [path.name for path in Path().iterdir()] == ["out"]
 
 
-@pytest.mark.parametrize(
-    ("text", "records"),
-    [
-        ("", ""),
-        ("{", ""),
-        ("[]\n", "another checksum"),
-        ("nonsense\n", "another checksum"),
-        ('{"boot":"","schema":"mlbatch.state/1"}\n', "another checksum"),
-    ],
-)
-def test_an_unreadable_state_is_ignored(shell: Shell, text: str, records: str) -> None:
+@pytest.mark.parametrize("text", ["", "{", "[]\n", "nonsense\n", '{"schema":"mlbatch.files/1"}\n'])
+def test_an_unreadable_list_of_files_is_ignored(shell: Shell, text: str) -> None:
+    whole = _whole(shell)
     _interrupt(shell)
-    STATE.write_text(text)
+    JOURNAL.write_text(text)
     outcome = shell(f"convert {CAPTURE} -o out --resume")
-    *damage, last = outcome.err.splitlines()
-    assert last == "mlbatch: out: nothing to resume; started over"
-    assert damage == [_damage(1)] * bool(records)
+    assert outcome.err == "mlbatch: out: nothing to resume; started over\n"
     assert outcome.code == 0
+    assert contents(Path()) == whole
 
 
-def _damage(record: int) -> str:
-    return (
-        f"mlbatch: {STATE}: expected records as they were written, found record {record} with "
-        "another checksum; scans from there on are converted again"
-    )
+def _swapped(lines: list[bytes]) -> list[bytes]:
+    return [*lines[:2], lines[3], lines[2]]
 
 
-def _swapped(lines: list[str]) -> list[str]:
-    return [*lines[:2], lines[3], lines[2], *lines[4:]]
-
-
-def _dropped(lines: list[str]) -> list[str]:
+def _dropped(lines: list[bytes]) -> list[bytes]:
     return [*lines[:2], *lines[3:]]
 
 
-def _repeated(lines: list[str]) -> list[str]:
+def _repeated(lines: list[bytes]) -> list[bytes]:
     return [*lines[:2], lines[1], *lines[2:]]
 
 
-def _changed(lines: list[str]) -> list[str]:
-    checksum, _, record = lines[2].partition(" ")
-    return [*lines[:2], f"{checksum} {record.replace('0', '1', 1)}", *lines[3:]]
+def _changed(lines: list[bytes]) -> list[bytes]:
+    return [*lines[:2], lines[2].replace(b"0", b"1", 1), *lines[3:]]
 
 
-@pytest.mark.parametrize("change", [_swapped, _dropped, _repeated, _changed])
-def test_records_from_a_damaged_one_on_are_made_again(
-    shell: Shell, change: Callable[[list[str]], list[str]]
+def _cut_off(lines: list[bytes]) -> list[bytes]:
+    return [*lines[:3], lines[3][:-7]]
+
+
+@pytest.mark.parametrize(
+    ("change", "count"),
+    [(_swapped, 3), (_dropped, 2), (_repeated, 3), (_changed, 2), (_cut_off, 2)],
+)
+def test_files_without_a_line_are_made_again(
+    shell: Shell, change: Callable[[list[bytes]], list[bytes]], count: int
 ) -> None:
-    """Records: the job, a scan each of three, synced."""
+    """Lines: the job, then a scan each; they do not depend on each other."""
     whole = _whole(shell)
     _interrupt(shell)
-    lines = STATE.read_text().splitlines()
-    assert len(lines) == 5
-    STATE.write_text("".join(f"{line}\n" for line in change(lines)))
-    outcome = shell(f"convert {CAPTURE} -o out --resume")
-    assert outcome.err.splitlines() == [_damage(3), "mlbatch: out: resumed after 1 scans"]
+    lines = JOURNAL.read_bytes().splitlines(keepends=True)
+    JOURNAL.write_bytes(b"".join(change(lines)))
+    for word in (f"resumed after {count} scans", "is complete"):
+        outcome = shell(f"convert {CAPTURE} -o out --resume")
+        assert (outcome.code, word in outcome.err) == (0, True)
     assert contents(Path()) == whole
 
 
-def test_a_record_cut_off_by_a_kill_is_no_damage(shell: Shell) -> None:
+@pytest.mark.parametrize("change", [_changed, _cut_off])
+def test_a_damaged_list_is_continued_twice(
+    shell: Shell, change: Callable[[list[bytes]], list[bytes]]
+) -> None:
+    """Lines behind a damaged one count, also those of a second run that is interrupted."""
     whole = _whole(shell)
     _interrupt(shell)
-    lines = STATE.read_text().splitlines()
-    STATE.write_text("\n".join(lines[:3])[:-7])
+    JOURNAL.write_bytes(b"".join(change(JOURNAL.read_bytes().splitlines(keepends=True))))
+    with pytest.MonkeyPatch.context() as patch:
+        _fail_at(patch, 3, KeyboardInterrupt())
+        assert shell(f"convert {CAPTURE} -o out --resume").code == 130
     outcome = shell(f"convert {CAPTURE} -o out --resume")
-    assert outcome.err == "mlbatch: out: resumed after 1 scans\n"
+    assert outcome.err == "mlbatch: out: resumed after 5 scans\n"
     assert contents(Path()) == whole
 
 
-def test_no_change_of_a_byte_gives_another_state(shell: Shell) -> None:
-    """What a changed file says is what some of its first records say, or nothing."""
+def test_no_change_of_a_byte_gives_another_scan(shell: Shell) -> None:
+    """What a changed list says is some of what it said."""
     _interrupt(shell)
-    content = STATE.read_bytes()
-    states = [state_file.read_state(STATE).state]
-    lines = content.splitlines(keepends=True)
-    for count in range(len(lines)):
-        STATE.write_bytes(b"".join(lines[:count]))
-        states.append(state_file.read_state(STATE).state)
-    assert len(lines) == 5
+    content = JOURNAL.read_bytes()
+    said = {position: one for position, one in files.records(JOURNAL)}
+    assert len(said) == 3
     for at in range(len(content)):
         for flip in (0x01, 0x20, 0x80, content[at] ^ ord("\n"), content[at] ^ ord("0")):
             if not flip:
                 continue
-            STATE.write_bytes(content[:at] + bytes([content[at] ^ flip]) + content[at + 1 :])
-            found = state_file.read_state(STATE)
-            assert found.state in states
-            assert found.state != states[0]
+            JOURNAL.write_bytes(content[:at] + bytes([content[at] ^ flip]) + content[at + 1 :])
+            found = [one for _, one in files.records(JOURNAL)]
+            assert all(one in said.values() for one in found)
+            assert 1 <= len(found) <= 3
 
 
 @pytest.mark.long
 def test_no_change_of_a_byte_gives_another_output(shell: Shell) -> None:
-    """The same to the end, for bytes of all records."""
+    """The same to the end, for bytes of all lines."""
     whole = _whole(shell)
     _interrupt(shell)
     Path("out.partial").rename("kept")
-    content = STATE.read_bytes()
+    content = Path("kept/files.jsonl").read_bytes()
     after = set()
     for at in range(3, len(content), len(content) // 40):
         shutil.rmtree("out", ignore_errors=True)
         shutil.copytree("kept", "out.partial")
-        STATE.write_bytes(content[:at] + bytes([content[at] ^ 4]) + content[at + 1 :])
+        JOURNAL.write_bytes(content[:at] + bytes([content[at] ^ 4]) + content[at + 1 :])
         outcome = shell(f"convert {CAPTURE} -o out --resume")
         after.add(outcome.err.splitlines()[-1])
         assert outcome.code == 0
         assert contents(Path()) == whole
-    assert after >= {
+    assert after == {
         "mlbatch: out: nothing to resume; started over",
-        "mlbatch: out: resumed after 1 scans",
         "mlbatch: out: resumed after 2 scans",
-        "mlbatch: out: resumed after 3 scans",
     }
 
 
-def test_after_a_restart_only_what_reached_the_disk_counts(
-    shell: Shell, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_did_not_reach_the_disk_is_made_again(shell: Shell) -> None:
+    """A power cut may keep the list and lose the end of files that it names."""
     whole = _whole(shell)
     _interrupt(shell)
-    lines = STATE.read_text().splitlines(keepends=True)
-    monkeypatch.setattr(state_file, "_boot", lambda: "later")
-    assert "synced" in lines[-1]
-    STATE.write_text("".join(lines[:-1]))
-    found = resume.find(Path("out"))
-    assert (found.state, found.is_complete) == (None, False)
-    STATE.write_text("".join(lines))
-    assert "resumed after 3 scans" in shell(f"convert {CAPTURE} -o out --resume").err
+    os.truncate("out.partial/000001.npz", 0)
+    os.truncate("out.partial/000002.npz", 4096)
+    outcome = shell(f"convert {CAPTURE} -o out --resume")
+    assert (outcome.code, outcome.err.count("others; made again")) == (0, 2)
     assert contents(Path()) == whole
 
 
@@ -761,19 +788,21 @@ def test_an_output_to_be_replaced_can_be_resumed(shell: Shell) -> None:
     assert contents(Path()) == whole
 
 
-@pytest.mark.parametrize("option", ["", "--overwrite"])
 def test_a_kill_after_the_last_rename_leaves_nothing_to_do(
-    shell: Shell, monkeypatch: pytest.MonkeyPatch, option: str
+    shell: Shell, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(state_file.StateFile, "remove", lambda file: None)
-    assert shell(f"convert {CAPTURE} -o out").code == 0
+    with monkeypatch.context() as patch:
+        patch.setattr(atomic, "tidy", lambda target, fsync: None)
+        assert shell(f"convert {CAPTURE} -o out").code == 0
+    assert Path("out/files.jsonl").exists()
     Path("out.old.partial").mkdir()
-    outcome = shell(f"convert {CAPTURE} -o out --resume {option}")
+    outcome = shell(f"convert {CAPTURE} -o out --resume")
     assert (outcome.code, outcome.err) == (
         0,
         "mlbatch: out: is complete; there is nothing to resume\n",
     )
     assert sorted(path.name for path in Path().iterdir()) == ["out"]
+    assert not Path("out/files.jsonl").exists()
 
 
 def test_a_dry_run_leaves_nothing_to_resume(shell: Shell) -> None:

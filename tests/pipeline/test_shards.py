@@ -1,4 +1,4 @@
-"""Every scan is of one shard, whatever the number of shards."""
+"""Every file is of one shard, whatever the number of shards."""
 
 from __future__ import annotations
 
@@ -8,25 +8,16 @@ from hypothesis import strategies as st
 from mlbatch.pipeline.shards import Shard, parse_shard
 
 
-@given(
-    index=st.integers(-1, 10**7),
-    slices=st.integers(1, 100),
-    count=st.integers(1, 200),
-    data=st.data(),
-)
-def test_every_scan_is_of_one_shard(
-    index: int, slices: int, count: int, data: st.DataObject
-) -> None:
-    part = data.draw(st.integers(0, slices - 1))
-    owners = [n for n in range(1, count + 1) if Shard(n, count).has(index, part, slices)]
-    assert len(owners) == 1
+@given(file=st.integers(-100, 10**9), count=st.integers(1, 200))
+def test_every_file_is_of_one_shard(file: int, count: int) -> None:
+    """Slices of the head have negative numbers."""
+    assert [Shard(number, count).has(file) for number in range(1, count + 1)].count(True) == 1
 
 
-@given(count=st.integers(1, 50), slices=st.integers(1, 7))
-def test_shards_have_the_same_number_of_scans(count: int, slices: int) -> None:
-    scans = [(index, part) for index in range(count) for part in range(slices)]
-    sizes = {sum(Shard(n, count).has(*scan, slices) for scan in scans) for n in range(1, count + 1)}
-    assert sizes == {slices}
+@given(count=st.integers(1, 50), each=st.integers(1, 7))
+def test_shards_have_the_same_number_of_files(count: int, each: int) -> None:
+    shards = [Shard(number, count) for number in range(1, count + 1)]
+    assert {sum(map(shard.has, range(count * each))) for shard in shards} == {each}
 
 
 @given(count=st.integers(1, 999_999), data=st.data())

@@ -6,7 +6,6 @@ import csv
 import itertools
 import json
 import zlib
-from collections.abc import Iterator
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -16,11 +15,11 @@ import yaml
 from mcap.reader import make_reader
 from rosbags.highlevel import AnyReader
 
-from mlbatch.errors import ExportError
 from mlbatch.pipeline import run
 from mlbatch.types import Scan
-from mlbatch.writers import ScanWriter, WriterOptions, open_writer
+from mlbatch.writers import FilesWriter, ScanWriter, WriterOptions, open_writer
 from mlbatch.writers.base import windows_per_file
+from tests.builders.files import Noted
 from tests.builders.scans import PERIOD_NS, START_NS, SUMMARY, dense_scan, imu_samples, run_job
 from tests.builders.sessions import FIXTURE, Shell, recording_shell
 from tests.builders.written_bags import ROS2_NOTE, note
@@ -235,67 +234,52 @@ def test_any_name_can_be_read(tmp_path: Path, name: str, seconds: float) -> None
         assert reader.message_count == 2
 
 
-def _numbers(folder: Path) -> Iterator[int]:
-    return iter(sorted(int(path.stem.rpartition("_")[2]) for path in folder.glob("*.mcap")))
-
-
 @pytest.mark.parametrize("has_notes", [True, False])
-def test_a_shard_writes_every_nth_file(tmp_path: Path, has_notes: bool) -> None:
+def test_files_of_other_runs_are_left_to_them(tmp_path: Path, has_notes: bool) -> None:
     """With one file in three: windows 2, 3 and 8, 9 of files 0 to 4.
 
     Without messages nothing of the other files is seen but scans without points.
     """
-    writer = open_writer(
-        *("rosbag2", tmp_path / "out", dense_scan().info),
-        WriterOptions(max_bag_s=0.2, share=(2, 3)),
-    )
-    finish_part = writer.finish_part  # type: ignore[attr-defined]
+    noted = Noted(lambda index: index // 2 % 3 == 1)
+    options = WriterOptions(max_bag_s=0.2, files=noted)
+    writer = open_writer("rosbag2", tmp_path / "out", dense_scan().info, options)
+    assert isinstance(writer, FilesWriter)
     for index in range(10):
-        is_own = index // 2 % 3 == 1
-        job = writer.write(_scan(index)) if is_own else writer.pass_over(_scan(index))  # type: ignore[attr-defined]
+        write = writer.write if noted.is_due(index) else writer.skip
+        job = write(_scan(index))
         job.start(index)
         if has_notes:
             writer.write_message(note(ROS2_NOTE, str(index), index * PERIOD_NS))
         run_job(job)
-    finish_part()
-    assert writer.bag_files == 5  # type: ignore[attr-defined]
-    assert list(_numbers(tmp_path / "out")) == [1, 4]
-    notes = [
-        message[8:-1].decode()
-        for number in (1, 4)
-        for topic, _, message in _messages(tmp_path / "out" / f"out_{number}.mcap")
-        if topic == "/note"
-    ]
+    # The last is complete with the output.
+    assert list(noted.crcs) == [(2, 0, None)]
+    writer.finish(SUMMARY)
+    names = [path.name for path in _files(tmp_path / "out")]
+    assert names == ["out_1.mcap", "out_4.mcap"]
+    crcs = [{name: zlib.crc32((tmp_path / "out" / name).read_bytes())} for name in names]
+    assert noted.crcs == {(2, 0, None): crcs[0], (8, 0, None): crcs[1]}
+    messages = [one for name in names for one in _messages(tmp_path / "out" / name)]
+    notes = [message[8:-1].decode() for topic, _, message in messages if topic == "/note"]
     assert notes == (["2", "3", "8", "9"] if has_notes else [])
     starts = [
-        (log_ns - START_NS) // PERIOD_NS
-        for number in (1, 4)
-        for topic, log_ns, _ in _messages(tmp_path / "out" / f"out_{number}.mcap")
-        if topic == "/points"
+        (log_ns - START_NS) // PERIOD_NS for topic, log_ns, _ in messages if topic == "/points"
     ]
     assert starts == [2, 3, 8, 9]
 
 
-def test_complete_files_survive_a_kill(tmp_path: Path) -> None:
-    """Two files are complete when the third begins; the resumed bag has the bytes of one run."""
-    scans = [0, 1, 2, 3, 4, 5]
-    _write(tmp_path / "whole", scans).finish(SUMMARY)
-    killed = _write(tmp_path / "out", scans[:5])
-    checkpoint = killed.checkpoint()
+def test_complete_files_are_noted_at_once(tmp_path: Path) -> None:
+    """Two files are complete when the third begins; a kill leaves them."""
+    noted = Noted()
+    killed = _write(tmp_path / "out", [0, 1, 2, 3, 4], files=noted)
     killed.abandon()
     partial = tmp_path / "out.partial"
-    kept = [(partial / f"out_{number}.mcap").stat() for number in (0, 1)]
-    data = b"".join((partial / f"out_{number}.mcap").read_bytes() for number in (0, 1))
-    assert checkpoint == (4, sum(one.st_size for one in kept), zlib.crc32(data))
-    resumed = _write(
-        tmp_path / "out", scans, kept_bytes=checkpoint.kept_bytes, kept_crc=checkpoint.kept_crc
-    )
-    resumed.finish(SUMMARY)
-    for number in range(3):
-        found = (tmp_path / "out" / f"out_{number}.mcap").read_bytes()
-        assert found == (tmp_path / "whole" / f"whole_{number}.mcap").read_bytes()
-    after = [(tmp_path / "out" / f"out_{number}.mcap").stat() for number in (0, 1)]
-    assert [one.st_mtime_ns for one in after] == [one.st_mtime_ns for one in kept]
+    crcs = {
+        (2 * number, 0, None): {
+            f"out_{number}.mcap": zlib.crc32((partial / f"out_{number}.mcap").read_bytes())
+        }
+        for number in (0, 1)
+    }
+    assert noted.crcs == crcs
 
 
 # -- what is refused ----------------------------------------------------------------------------
@@ -344,13 +328,3 @@ def test_one_file_is_not_taken_for_the_output(shell: Shell, command: str) -> Non
         "mlbatch: error: out/out_1.mcap: expected a whole output, found one of the files of a bag; "
         "name its folder\n"
     )
-
-
-def test_a_lost_file_is_not_resumed(tmp_path: Path) -> None:
-    killed = _write(tmp_path / "out", [0, 1, 2])
-    kept_bytes = killed.checkpoint().kept_bytes
-    killed.abandon()
-    (tmp_path / "out.partial" / "out_0.mcap").unlink()
-    words = f"expected {kept_bytes} bytes of complete files of the interrupted run, found"
-    with pytest.raises(ExportError, match=words):
-        _write(tmp_path / "out", [0, 1, 2], kept_bytes=kept_bytes)

@@ -51,12 +51,11 @@ def test_parts_follow_each_other(
             part = content(length, seed)
             direct.put(memoryview(part))
             expected += part
-            # What it says to be handed over survives a kill.
-            handed = direct.handed_bytes
-            assert path.read_bytes()[:handed] == expected[:handed]
-            assert len(expected) - handed < STAGE_BYTES
+            # All but the stage is handed over.
+            written = path.read_bytes()
+            assert written == expected[: len(written)]
+            assert len(expected) - len(written) < STAGE_BYTES
         direct.finish()
-        assert direct.handed_bytes == len(expected)
     finally:
         os.close(descriptor)
     assert path.read_bytes() == expected
@@ -104,23 +103,17 @@ def test_a_full_disk_is_an_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     with pytest.raises(OSError, match="full"):
         direct.put(content(STAGE_BYTES, 1))
     os.close(descriptor)
-    assert direct.handed_bytes == 0
+    assert path.read_bytes() == b""
 
 
-@pytest.mark.parametrize("kept", [None, 0, 5000])
-def test_large_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kept: int | None) -> None:
-    """Also those that continue an interrupted run."""
+def test_large_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(output_file, "_DROP_BYTES", 3 * BLOCK_BYTES)
     parts = [content(length, length) for length in (5000, 1, 9000, 40_000, 0, 3, 70_001)]
     path = tmp_path / "file"
-    if kept is not None:
-        path.write_bytes(b"".join(parts)[: kept + 77])
-    file = OutputFile(path, kept, zlib.crc32(b"".join(parts)[: kept or 0]))
+    file = OutputFile(path)
     for part in parts:
         file.put(part, b"-") if part is parts[-1] else file.put(part)
-        assert path.stat().st_size >= file.handed_bytes
-        assert file.handed_bytes <= file.position_bytes
+    assert file.position_bytes == len(b"".join(parts)) + 1
     file.complete()
     assert path.read_bytes() == b"".join(parts) + b"-"
-    assert file.handed_bytes == len(b"".join(parts)) + 1
     assert file.crc == zlib.crc32(path.read_bytes())

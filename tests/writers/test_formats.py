@@ -1,11 +1,10 @@
-"""Laws of every format: atomic, independent of threads, resumable, equal bytes for equal runs."""
+"""Laws of every format: atomic, locked, independent of threads, equal bytes for equal runs."""
 
 from __future__ import annotations
 
 import signal
 import subprocess
 import sys
-import zlib
 from dataclasses import replace
 from pathlib import Path
 
@@ -205,109 +204,37 @@ def test_stages_in_any_thread_may_come_in_any_order(name: str, tmp_path: Path) -
 
 @each_format
 @pytest.mark.parametrize("kind", ["dense", "organized"])
-@pytest.mark.parametrize("is_large", [False, True])
-def test_a_continued_output_has_the_same_bytes(
-    name: str, kind: str, is_large: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def test_large_outputs_have_the_same_bytes(
+    name: str, kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """After every number of scans, with other bytes after those of the checkpoint.
-
-    is_large: written past the page cache, so that the end of what is written waits in memory.
-    """
-    if is_large:
-        monkeypatch.setattr(output_file, "_DROP_BYTES", 100_000)
-        monkeypatch.setattr(direct_writes, "_STAGE_BYTES", 8 * direct_writes.BLOCK_BYTES)
+    """Written past the page cache, so that the end of what is written waits in memory."""
     try:
         check_target(name, tmp_path / "x", WriterOptions(), kind)
     except UsageError:
         pytest.skip("the format has no such layout")
-
-    def scan_of(index: int) -> Scan:
-        if kind == "dense":
-            return dense_scan(index, 50_000)
-        return replace(organized_scan(15_000), index=index)
-
-    scans = [scan_of(index) for index in range(4)]
+    if kind == "dense":
+        scans = [dense_scan(index, 50_000) for index in range(4)]
+    else:
+        scans = [replace(organized_scan(15_000), index=index) for index in range(4)]
     expected = whole(name, tmp_path / "whole", scans)
-    for done in range(1, 5):
-        folder = tmp_path / str(done)
-        folder.mkdir()
-        target = folder / OUTPUTS[name]
-        writer = open_writer(name, target, scans[0].info, WriterOptions())
-        for scan in scans[:done]:
-            writer.write_imu(imu_samples(0, scan.start_ns))
-            run_job(writer.write(scan))
-        checkpoint = writer.checkpoint()
-        writer.abandon()
-        safe = checkpoint.scans
-        assert safe == done or (is_large and safe == done - 1)
-        partial = folder / f"{target.name}.partial"
-        if partial.is_file():
-            with partial.open("ab") as file:
-                file.write(b"of no scan")
-        kept = (checkpoint.kept_bytes, checkpoint.kept_crc)
-        options = WriterOptions(kept_bytes=kept[0], kept_crc=kept[1])
-        writer = open_writer(name, target, scans[0].info, options)
-        for number in range(4):
-            scan = scan_of(number)
-            writer.write_imu(imu_samples(0, scan.start_ns))
-            if number < safe:
-                scan.xyz[:] = 0  # the points of skipped scans are not used
-                run_job(writer.skip(scan))
-            else:
-                run_job(writer.write(scan))
-        run_job(writer.flush())
-        writer.finish(SUMMARY)
-        assert files(folder) == expected
+    monkeypatch.setattr(output_file, "_DROP_BYTES", 100_000)
+    monkeypatch.setattr(direct_writes, "_STAGE_BYTES", 8 * direct_writes.BLOCK_BYTES)
+    assert whole(name, tmp_path / "large", scans) == expected
 
 
-def _largest(folder: Path) -> Path:
-    """The file of scans below a folder."""
-    files = [path for path in folder.rglob("*") if path.is_file()]
-    return max(files, key=lambda path: path.stat().st_size)
-
-
-@pytest.mark.parametrize("name", CONTAINERS)
-def test_a_file_of_another_length_is_not_continued(name: str, tmp_path: Path) -> None:
-    def continued(kept_bytes: int) -> None:
-        kept_crc = zlib.crc32(_largest(tmp_path).read_bytes()[:kept_bytes])
-        options = WriterOptions(kept_bytes=kept_bytes, kept_crc=kept_crc)
-        writer = open_writer(name, target, run_info(), options)
-        for scan in scans:
-            run_job(writer.skip(scan))
-
-    target = tmp_path / OUTPUTS[name]
-    scans = [dense_scan(index, 50_000) for index in range(3)]
-    writer = open_writer(name, target, run_info(), WriterOptions())
-    for scan in scans:
-        run_job(writer.write(scan))
-    checkpoint = writer.checkpoint()
-    kept_bytes = checkpoint.kept_bytes
-    writer.abandon()
-    with pytest.raises(ExportError, match=f"expected {kept_bytes + 1} bytes of the interrupted"):
-        continued(kept_bytes + 1)
-    with pytest.raises(ExportError, match=r"of the interrupted run, found other(s| bytes); leave"):
-        continued(kept_bytes - 1)
-
-
-@pytest.mark.parametrize("name", CONTAINERS)
-@pytest.mark.parametrize("place", [0.1, 0.5, 1.0])
-def test_a_file_with_a_changed_byte_is_not_continued(
-    name: str, place: float, tmp_path: Path
-) -> None:
+@each_format
+def test_an_output_that_another_run_writes_is_refused(name: str, tmp_path: Path) -> None:
+    """In the same process as well; it is free again after the other ended."""
     target = tmp_path / OUTPUTS[name]
     writer = open_writer(name, target, run_info(), WriterOptions())
-    for index in range(3):
-        run_job(writer.write(dense_scan(index, 50_000)))
-    kept = writer.checkpoint()
-    writer.abandon()
-    with _largest(tmp_path).open("r+b") as file:
-        file.seek(int((kept.kept_bytes - 1) * place))
-        old = file.read(1)[0]
-        file.seek(-1, 1)
-        file.write(bytes([old ^ 1]))
-    options = WriterOptions(kept_bytes=kept.kept_bytes, kept_crc=kept.kept_crc)
-    with pytest.raises(ExportError, match="expected the bytes that the interrupted run"):
-        open_writer(name, target, run_info(), options)
+    with pytest.raises(ExportError, match="expected no other run that writes it, found one; wait"):
+        open_writer(name, target, run_info(), WriterOptions())
+    run_job(writer.write(dense_scan(0)))
+    writer.finish(SUMMARY)
+    assert target.exists()
+    overwrite = WriterOptions(overwrite=True)
+    open_writer(name, target, run_info(), overwrite).abandon()
+    open_writer(name, target, run_info(), overwrite).finish(SUMMARY)
 
 
 @each_format

@@ -1,14 +1,15 @@
-"""Folders with a file a scan: names, sensors, and files that a continued run lacks."""
+"""Folders with a file a scan: names, sensors, and files that other runs make."""
 
 from __future__ import annotations
 
+import zlib
 from pathlib import Path
 
 import pytest
 
-from mlbatch.errors import ExportError
-from mlbatch.writers import WriterOptions, open_writer
+from mlbatch.writers import FilesWriter, WriterOptions, open_writer
 from mlbatch.writers.scan_folder import scan_name
+from tests.builders.files import Noted
 from tests.builders.scans import SUMMARY, dense_scan, run_info, run_job
 
 
@@ -43,9 +44,21 @@ def test_an_abandoned_output_stays_partial(tmp_path: Path) -> None:
     assert [path.name for path in tmp_path.iterdir()] == ["out.partial"]
 
 
-def test_a_skipped_scan_must_have_its_file(tmp_path: Path) -> None:
-    (tmp_path / "out.partial").mkdir()
-    writer = open_writer("ply", tmp_path / "out", run_info(), WriterOptions(kept_bytes=0))
-    with pytest.raises(ExportError, match=r"000000\.ply: expected a scan .*, found no file; leave"):
-        run_job(writer.skip(dense_scan()))
-    assert writer.checkpoint().scans == 0
+def test_files_of_other_runs_are_left_to_them(tmp_path: Path) -> None:
+    """A skipped scan has no file, but is in lists of all; others are noted once they are whole."""
+    noted = Noted()
+    options = WriterOptions(files=noted, split=True)
+    writer = open_writer("nuscenes", tmp_path / "out", run_info(), options)
+    assert isinstance(writer, FilesWriter)
+    run_job(writer.skip(dense_scan(0), 1))
+    job = writer.write(dense_scan(1), 1)
+    job.pack()
+    assert noted.crcs == {}
+    job.commit()
+    writer.finish(SUMMARY)
+    out = tmp_path / "out"
+    files = sorted(path.relative_to(out).as_posix() for path in out.rglob("*.bin"))
+    assert files == ["right/000001.pcd.bin", "right/000001.time.bin"]
+    crcs = {name: zlib.crc32((out / name).read_bytes()) for name in files}
+    assert noted.crcs == {(1, 0, 1): crcs}
+    assert len((out / "right/times.txt").read_text().splitlines()) == 2

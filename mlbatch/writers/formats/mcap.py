@@ -30,10 +30,10 @@ def record_layout(options: WriterOptions) -> RecordLayout | None:
 def open_writer(target: Path, info: RunInfo, options: WriterOptions) -> ScanWriter:
     """Start an MCAP file."""
 
-    def open_file(path: Path, kept_bytes: int | None, kept_crc: int) -> MessageFile:
+    def open_file(path: Path) -> MessageFile:
         # Imported here, so that naming the format does not load the library.
         from mlbatch.writers.mcap_container import McapContainer
 
-        return McapContainer(path, kept_bytes, options.compression, kept_crc=kept_crc)
+        return McapContainer(path, options.compression)
 
     return MessageWriter(target, info, options, Cdr, open_file)

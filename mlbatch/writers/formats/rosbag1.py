@@ -14,9 +14,8 @@ from typing import TYPE_CHECKING, BinaryIO, cast
 from mlbatch.errors import ExportError
 from mlbatch.ros.encoding import Ros1
 from mlbatch.types import Message, RecordLayout, RunInfo, Summary, Topic
-from mlbatch.writers.base import ScanWriter, WriterOptions, Written
+from mlbatch.writers.base import ScanWriter, WriterOptions
 from mlbatch.writers.message_writer import MessageWriter, PendingChunk, extras_of, record_of
-from mlbatch.writers.output_file import BufferedFile
 
 if TYPE_CHECKING:
     from rosbags.interfaces import Connection
@@ -58,29 +57,19 @@ class _OpenPath:
 class _Rosbag1File:
     """Connections and messages of one bag; `rosbags` writes each chunk when it is complete."""
 
-    def __init__(self, path: Path, kept_bytes: int | None, kept_crc: int) -> None:
+    def __init__(self, path: Path) -> None:
         from rosbags.rosbag1 import Writer
         from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
         self._types = get_typestore(Stores.ROS1_NOETIC)
         self._types.register(get_types_from_msg(_TF_TEXT, _TF))
         self._connections: dict[str | Topic, Connection] = {}
-        self._file = BufferedFile(path, kept_bytes, kept_crc)
+        self._file = path.open("wb")
         # The library refuses a path that exists: it gets one below a file, which cannot exist.
         self._bag = Writer(path / path.name)
-        # A library that writes in order uses no other methods.
-        self._bag.path = cast(Path, _OpenPath(cast(BinaryIO, self._file)))
+        self._bag.path = cast(Path, _OpenPath(self._file))
         self._bag.open()
-        self._written = Written(0, self._file.tell(), self._file.crc)
-
-    @property
-    def complete_chunks(self) -> int:
-        """Number of written chunks: the next message is added to this chunk."""
-        return self._written.chunks
-
-    def written(self) -> Written:
-        """Return the chunks that the system has."""
-        return self._written
+        self._written_bytes = self._file.tell()
 
     def take_chunks(self) -> Sequence[PendingChunk]:
         """Return nothing: chunks are written at once."""
@@ -126,11 +115,9 @@ class _Rosbag1File:
     def _write(self, connection: Connection, log_ns: int, message: bytes | memoryview) -> None:
         self._bag.write(connection, log_ns, message)
         # The library collects messages in memory: the file grows when a chunk is complete.
-        if self._file.tell() > self._written.kept_bytes:
-            self._file.flush()
+        if self._file.tell() > self._written_bytes:
+            self._written_bytes = self._file.tell()
             self._forget_places()
-            # One assignment: `written` is called while another scan is appended.
-            self._written = Written(self._written.chunks + 1, self._file.tell(), self._file.crc)
 
     def _forget_places(self) -> None:
         """Replace the times and places of messages in written chunks, of which the number is used.

@@ -40,7 +40,7 @@ def open_writer(target: Path, info: RunInfo, options: WriterOptions) -> ScanWrit
 
         return BagWriter(target, info, options, check_topic)
 
-    def open_file(folder: Path, kept_bytes: int | None, kept_crc: int) -> MessageFile:
+    def open_file(folder: Path) -> MessageFile:
         # Imported here, so that naming the format does not load the library.
         from mlbatch.writers.mcap_container import McapContainer
 
@@ -50,9 +50,7 @@ def open_writer(target: Path, info: RunInfo, options: WriterOptions) -> ScanWrit
             text = metadata_text([file_of_container(container, path.name)])
             (folder / METADATA).write_text(text, encoding="utf-8", newline="\n")
 
-        return McapContainer(
-            path, kept_bytes, options.compression, check_topic, write_metadata, kept_crc
-        )
+        return McapContainer(path, options.compression, check_topic, write_metadata)
 
     return MessageWriter(target, info, options, Cdr, open_file, folder=True)
 

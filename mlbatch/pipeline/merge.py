@@ -1,13 +1,13 @@
 """`mlbatch merge`: the folders of all shards to the output of one run.
 
 Nothing is read but the folders. Every shard has made the account of the whole recording: all must
-be the same. Each has the points of its own scans, whose sum completes the report.
+be the same. Each has the points of its own scans, whose sum completes the report, and its rows of
+scans.csv.
 """
 
 from __future__ import annotations
 
 import contextlib
-import heapq
 import os
 import resource
 import shutil
@@ -18,50 +18,83 @@ from pathlib import Path
 from typing import Any
 
 from mlbatch.errors import ExportError, RecordingError, UsageError
-from mlbatch.pipeline import resume
+from mlbatch.pipeline.files import records
 from mlbatch.pipeline.job_identity import difference
 from mlbatch.pipeline.point_notes import point_notes, refuse_all_removed
-from mlbatch.pipeline.shard_part import Account, ShardScan, read_account
-from mlbatch.pipeline.state_file import State, StateFile, state_path
+from mlbatch.pipeline.shards import Account, read_account
 from mlbatch.report.ledger import PointCounts
 from mlbatch.report.report import (
     RunReport,
     SensorReport,
     Timing,
     Warned,
-    fill_totals,
     imbalances,
     report_text,
 )
-from mlbatch.report.scan_table import ScanTable
-from mlbatch.types import Summary
+from mlbatch.report.scan_table import ScanStatistics, merged_table
 from mlbatch.writers import (
+    FILES_JSONL,
     REPORT_JSON,
-    ScanWriter,
-    WriterOptions,
-    check_name,
+    SCANS_CSV,
     choose_format,
     discard,
     export_errors,
-    open_writer,
+    prepare,
     write_text,
 )
-from mlbatch.writers.scan_folder import FolderWriter, checksum_of
+from mlbatch.writers.bag_writer import name_of_file, number_of_file, write_metadata
+from mlbatch.writers.output_file import crc32, file_crc
 
 _KB_PER_MB = 1024
+_AGAIN = "copy the part again, or convert this shard again with --overwrite"
 
 
 @dataclass(frozen=True, slots=True)
 class Part:
-    """The folder of a shard and its account."""
+    """The folder of a shard, its account, and the CRC-32 of its files by name."""
 
     folder: Path
     account: Account
+    crcs: dict[str, int]
+
+
+def _read_part(folder: Path) -> Part:
+    account = read_account(folder)
+    path = folder / FILES_JSONL
+    crcs: dict[str, int] = dict(account.lists)
+    scans = 0
+    with _readable(path):
+        for _, record in records(path):
+            if not account.shard.has(record.unit[0]):
+                raise RecordingError(
+                    f"{folder}: expected the scans of shard {account.shard}, found others; convert "
+                    "this shard again with --overwrite"
+                )
+            crcs |= record.crcs
+            scans += len(record.scans)
+    if any(Path(name).is_absolute() or ".." in Path(name).parts for name in crcs):
+        raise RecordingError(f"{path}: expected files in {folder}, found others; {_AGAIN}")
+    if scans != account.scans:
+        raise RecordingError(
+            f"{path}: expected the files of {account.scans} scans, found those of {scans}; {_AGAIN}"
+        )
+    return Part(folder, account, crcs)
+
+
+@contextlib.contextmanager
+def _readable(path: Path) -> Iterator[None]:
+    """Convert an OSError while a file of a part is read to a RecordingError of one line."""
+    try:
+        yield
+    except OSError as err:
+        raise RecordingError(
+            f"{path}: expected a file of a shard, found {err.strerror!r}; {_AGAIN}"
+        ) from err
 
 
 def read_parts(folders: Sequence[Path]) -> list[Part]:
     """The parts of one conversion, by number; UsageError unless each is there once."""
-    parts = [Part(folder, read_account(folder)) for folder in folders]
+    parts = [_read_part(folder) for folder in folders]
     first = parts[0]
     count = first.account.shard.count
     for part in parts[1:]:
@@ -107,20 +140,12 @@ def _check_same(parts: Sequence[Part]) -> None:
                 f"{part.folder}: expected the account of {parts[0].folder}, found another: "
                 f"{found}; a recording was changed: convert both shards again"
             )
-    slices = parts[0].account.info.slices
-    for part in parts:
-        shard = part.account.shard
-        if not all(shard.has(scan.index, scan.slice, slices) for scan in part.account.scans):
-            raise RecordingError(
-                f"{part.folder}: expected the scans of shard {shard}, found others; convert this "
-                "shard again with --overwrite"
-            )
     total = parts[0].account.total
-    numbers = [scan.number for _, scan in _merged_scans(parts)]
-    if numbers != list(range(total)):
+    scans = sum(part.account.scans for part in parts)
+    if scans != total:
         raise RecordingError(
-            f"expected the {total} scans of the recording in {len(parts)} shards, found "
-            f"{len(numbers)}; convert all shards again"
+            f"expected the {total} scans of the recording in {len(parts)} shards, found {scans}; "
+            "convert all shards again"
         )
 
 
@@ -153,54 +178,30 @@ def merge(
     """
     began_s = time.perf_counter(), time.process_time()
     _check_apart(parts, target)
-    check_name(target)
     choose_format(target, parts[0].account.format)
-    # A run that writes this output is an error; what an interrupted one left is replaced.
-    resume.find(target)
-    resume.forget(target)
-    account = parts[0].account
-    options = WriterOptions(
-        overwrite=overwrite,
-        split=account.is_split,
-        ply_style=account.ply_style,
-        fsync=fsync,
-        max_bag_s=account.max_bag_s,
-    )
-    lock = StateFile(state_path(target), State({}, ""), is_new=True)
+    output = prepare(target, overwrite, folder=True, fsync=fsync)
     try:
-        writer = open_writer(account.format, target, account.info, options)
-        if isinstance(writer, FolderWriter):
-            _take_scans(parts, writer)
-        else:
-            _take_bag(parts, writer)
-        table = ScanTable(account.info, account.columns_per_s)
-        for _, figures in _merged_scans(parts):
-            table.add(figures.scan(account.info), figures.checksum)
-        report = _merged_report(parts, table, command)
+        for part in parts:
+            _take_files(part, output.partial, target.name)
+        if parts[0].account.windows:
+            _describe_bag(parts, output.partial, target.name)
+        table = merged_table([_table(part) for part in parts])
+        report = _merged_report(parts, command)
         broken = imbalances(report) or _unequal_points(report)
         if broken:
             raise RecordingError(
                 f"the ledger does not balance: {broken[0]}; a shard.json was changed: convert all "
                 "shards again, and report it if this remains"
             )
-        summary = Summary(
-            report.t_init_ns,
-            report_text(report, machine=False),
-            table.text(),
-            fill_totals(report),
-        )
-
-        def complete(partial: Path) -> None:
-            nonlocal report
-            report = report._replace(timing=_timing(parts, report, began_s))
-            write_text(partial / REPORT_JSON, report_text(report), fsync)
-
-        writer.finish(summary, complete)
+        write_text(output.partial / SCANS_CSV, table)
+        output.sync()
+        report = report._replace(timing=_timing(parts, report, began_s))
+        write_text(output.partial / REPORT_JSON, report_text(report), fsync)
+        output.publish()
     except BaseException:
+        output.close()
         discard(target)
         raise
-    finally:
-        lock.remove()
     return report
 
 
@@ -216,96 +217,65 @@ def _check_apart(parts: Sequence[Part], target: Path) -> None:
             )
 
 
-def _merged_scans(parts: Sequence[Part]) -> Iterator[tuple[Part, ShardScan]]:
-    """All scans in order, each with the part that has it."""
-    scans = (
-        [(scan.number, number, scan) for scan in part.account.scans]
-        for number, part in enumerate(parts)
-    )
-    for _, number, scan in heapq.merge(*scans, key=lambda one: one[:2]):
-        yield parts[number], scan
+def _take_files(part: Part, folder: Path, stem: str) -> None:
+    """Have the files of a part in a folder as well; stem: what those of a bag begin with.
+
+    They are linked, or copied to another file system.
+    """
+    for name, crc in part.crcs.items():
+        source = part.folder / name
+        number = number_of_file(name) if part.account.windows else None
+        path = folder / (name if number is None else name_of_file(stem, number))
+        with _readable(source):
+            found = file_crc(source)
+        if found != crc:
+            raise RecordingError(
+                f"{source}: expected the bytes that the shard has written, found others; {_AGAIN}"
+            )
+        if path.exists():
+            # A list of all scans, which every part has.
+            continue
+        with export_errors(path):
+            path.parent.mkdir(exist_ok=True)
+            with contextlib.suppress(OSError):
+                # A link to what a symbolic link names: the output is whole without the part.
+                os.link(source.resolve(), path)
+                continue
+            shutil.copyfile(source, path)
 
 
-def _take_scans(parts: Sequence[Part], writer: FolderWriter) -> None:
-    """Have the files of all scans in the output."""
-    info = parts[0].account.info
-    for owner, figures in _merged_scans(parts):
-        scan = figures.scan(info)
-        sources: list[Path] = []
-        for path in writer.files(scan, figures.only).values():
-            name = path.relative_to(writer.folder)
-            sources.append(owner.folder / name)
-            _take(sources[-1], owner.account.files.get(name.as_posix()), path)
-        _check_bytes(sources, figures.checksum)
-        writer.skip(scan, figures.only).commit()
-
-
-def _take_bag(parts: Sequence[Part], writer: ScanWriter) -> None:
-    """Have the files of a bag in the output; RecordingError unless each is in one part."""
-    from mlbatch.writers.bag_metadata import read_file
-    from mlbatch.writers.bag_writer import BagWriter, number_of_file
-
-    account = parts[0].account
-    if not isinstance(writer, BagWriter):
-        raise UsageError(f"{account.format}: expected a format with several files, found another")
-    owners = [
-        (number_of_file(name), part.folder / name, size, part.account.checksums.get(name))
-        for part in parts
-        for name, size in part.account.files.items()
-    ]
-    numbers = sorted(-1 if number is None else number for number, *_ in owners)
-    if numbers != list(range(account.bag_files)):
+def _describe_bag(parts: Sequence[Part], folder: Path, stem: str) -> None:
+    """Write metadata.yaml of a bag; RecordingError unless each of its files is in one part."""
+    numbers = sorted(number_of_file(name) or 0 for part in parts for name in part.crcs)
+    if numbers != list(range(len(numbers))):
         raise RecordingError(
-            f"expected the {account.bag_files} files of the bag in {len(parts)} shards, found "
-            f"{len(numbers)}; convert all shards again"
+            f"expected the files of a bag from 0 to {len(numbers) - 1} in {len(parts)} shards, "
+            f"found {', '.join(map(str, numbers))}; convert all shards again"
         )
-    for number, source, size, checksum in owners:
-        _take(source, size, writer.path_of_file(number or 0))
-        _check_bytes([source], checksum)
-        # An error names the part, not the output.
-        read_file(source)
-    writer.adopt_files(account.bag_files)
+    with export_errors(folder):
+        write_metadata(folder, stem, numbers)
 
 
-def _take(source: Path, size: int | None, path: Path) -> None:
-    """Have a file of a part in the output as well: linked, or copied to another file system."""
-    try:
-        found = source.stat().st_size
-    except OSError as err:
+def _table(part: Part) -> str:
+    """The scans.csv of a part."""
+    path = part.folder / SCANS_CSV
+    with _readable(path):
+        data = path.read_bytes()
+    if crc32(data, 0) != part.account.table:
         raise RecordingError(
-            f"{source}: expected a file of a scan, found {err.strerror!r}; copy the part again, or "
-            "convert this shard again with --overwrite"
-        ) from err
-    if found != size:
-        raise RecordingError(
-            f"{source}: expected {size} bytes, found {found}; copy the part again, or convert this "
-            "shard again with --overwrite"
+            f"{path}: expected the bytes that the shard has written, found others; {_AGAIN}"
         )
-    with export_errors(path):
-        with contextlib.suppress(OSError):
-            # A link to what a symbolic link names: the output is whole without the part.
-            os.link(source.resolve(), path)
-            return
-        shutil.copyfile(source, path)
-
-
-def _check_bytes(sources: Sequence[Path], checksum: int | None) -> None:
-    """Compare files of a part with their checksum."""
-    if checksum_of(sources) != checksum:
-        raise RecordingError(
-            f"{sources[0]}: expected the bytes that the shard has written, found others; copy the "
-            "part again, or convert this shard again with --overwrite"
-        )
+    return data.decode()
 
 
 # -- the report -------------------------------------------------------------------------------
 
 
-def _merged_report(parts: Sequence[Part], table: ScanTable, command: str) -> RunReport:
+def _merged_report(parts: Sequence[Part], command: str) -> RunReport:
     """The report of one run, without timings."""
     account = parts[0].account
     earlier = account.report
-    scans = table.statistics(earlier.scans.empty, earlier.scans.dropped_incomplete)
+    scans = _merged_scans(parts)
     sensors = tuple(_merged_sensor(parts, number) for number in range(len(earlier.sensors)))
     where = ", ".join(one.path for one in earlier.inputs)
     refuse_all_removed(where, [one.ledger.points for one in sensors])
@@ -325,6 +295,18 @@ def _merged_report(parts: Sequence[Part], table: ScanTable, command: str) -> Run
         timing=None,
         command=" && ".join([*commands, command]),
         identity=account.identity,
+    )
+
+
+def _merged_scans(parts: Sequence[Part]) -> ScanStatistics:
+    """The figures of all scans: those about points are sums of all shards."""
+    each = [part.account.report.scans for part in parts]
+    names = [sensor.name for sensor in parts[0].account.report.sensors]
+    no_points = {name: sum(scans.no_points.get(name, 0) for scans in each) for name in names}
+    return each[0]._replace(
+        no_points={name: count for name, count in no_points.items() if count},
+        empty_clouds=sum(scans.empty_clouds for scans in each),
+        points=sum(scans.points for scans in each),
     )
 
 
