@@ -20,7 +20,8 @@ from typing import TypeAlias
 import numpy as np
 
 from mlbatch.arrays import I64Array, U8Array
-from mlbatch.readers.byte_records import SLACK, copy_runs
+from mlbatch.native.capture import CaptureLoops
+from mlbatch.readers.byte_records import SLACK
 from mlbatch.types import MAX_OVERLAP_NS, PacketBatch, Recording
 
 # Called with the next packets of a recording, before they are merged; None: it has no more.
@@ -215,7 +216,7 @@ def _interleave(
     first = 0
     for batch, _ in ready:
         rows = slice(first, first + len(batch))
-        copy_runs(batch.data, batch.start, batch.size, out, start[rows])
+        CaptureLoops().copy_runs(batch.data, batch.start, batch.size, out, start[rows])
         first += len(batch)
     order = np.argsort(np.concatenate([key_ns for _, key_ns in ready]), kind="stable")
     stream = np.concatenate([batch.stream for batch, _ in ready])

@@ -13,7 +13,6 @@ from hypothesis import strategies as st
 from mlbatch.decode.packet_ring import packet_sums
 from mlbatch.errors import RecordingError
 from mlbatch.native.capture import CaptureLoops
-from mlbatch.readers.byte_records import copy_runs
 from tests.builders.captures import pcap_bytes, udp_frame
 from tests.builders.reading import open_capture, read
 from tests.readers.capture.test_recording import damaged, mixed_frames
@@ -56,10 +55,11 @@ def test_runs_are_copied() -> None:
     size = pick.integers(0, 90, 40)
     start = pick.integers(0, 4900, 40)
     place = np.cumsum(size) - size
-    one, other = np.zeros(5000, np.uint8), np.zeros(5000, np.uint8)
-    copy_runs(source, start, size, one, place)
-    CaptureLoops().copy_runs(source, start, size, other, place)
-    assert one.tobytes() == other.tobytes()
+    out = np.zeros(5000, np.uint8)
+    CaptureLoops().copy_runs(source, start, size, out, place)
+    runs = zip(start.tolist(), size.tolist(), strict=True)
+    copied = b"".join(source[at : at + count].tobytes() for at, count in runs)
+    assert out.tobytes() == copied.ljust(5000, b"\0")
 
 
 @pytest.mark.parametrize(
