@@ -52,6 +52,7 @@ from mlbatch.writers import (
     partial_path,
     record_layout,
     report_paths,
+    state_path,
     sync_entries,
     tidy,
     write_text,
@@ -460,7 +461,7 @@ def _files(job: Job, output: Path, name: str, options: WriterOptions, *, resumes
     from mlbatch.pipeline.files import Files, find
 
     partial = partial_path(output)
-    old = partial.with_name(f"{partial.name}.state")
+    old = state_path(output)
     if old.is_file():
         say(
             f"{old}: expected {FILES_JSONL} in {partial}, found the state file of an earlier "

@@ -18,6 +18,7 @@ from mlbatch.writers import (
     old_path,
     partial_path,
     report_paths,
+    state_path,
 )
 
 # Outputs of whole recordings took 0.51 to 7 times their bytes (sparse LEGACY packets to MCAP; dense
@@ -58,7 +59,7 @@ def check_output(job: Job, output: Path, name: str) -> None:
 
 def _own_files(output: Path, name: str) -> list[Path]:
     """Files that a run creates or removes, apart from those in an output folder."""
-    files = [output, partial_path(output), old_path(output)]
+    files = [output, partial_path(output), old_path(output), state_path(output)]
     paths = report_paths(output, name)
     if paths.report.parent != output:
         files += [

@@ -22,6 +22,7 @@ from mlbatch.writers.atomic import (
     partial_path,
     prepare,
     side_path,
+    state_path,
     tidy,
     write_text,
 )
@@ -86,6 +87,7 @@ __all__ = [
     "prepare",
     "record_layout",
     "report_paths",
+    "state_path",
     "sync_entries",
     "tidy",
     "write_text",

@@ -212,6 +212,12 @@ def old_path(target: Path) -> Path:
     return target.with_name(f"{target.name}.old{PARTIAL_SUFFIX}")
 
 
+def state_path(target: Path) -> Path:
+    """Return the path of the state file that earlier versions kept of an unfinished output."""
+    partial = partial_path(target)
+    return partial.with_name(f"{partial.name}.state")
+
+
 def tidy(target: Path, fsync: bool = True) -> None:
     """Remove what is of no use once `target` is complete; a killed run may have left it."""
     old = old_path(target)
