@@ -406,7 +406,7 @@ static void project_corrected(const Group *group, int64_t encoder, int64_t table
 }
 
 /* Rotate a direction by a small angle, below 0.05 rad: the next terms are d**5 / 120. */
-static void rotate(float *cosine, float *sine, float more)
+static inline void rotate(float *cosine, float *sine, float more)
 {
     const float square = more * more;
     const float by_sine = (square * (float)(-1.0 / 6) + 1.0f) * more;
@@ -416,48 +416,68 @@ static void rotate(float *cosine, float *sine, float more)
     *sine = *sine * by_cosine + before * by_sine;
 }
 
+/* Corrections of azimuth and elevation of the beams of a column, by the cells of the tables over
+   the rotor angle. */
+static void correct_mirrored(const Group *group, int64_t encoder, const float *firing_ns,
+                             float *restrict azimuth, float *restrict elevation)
+{
+    const double revolution = 2 * 3.141592653589793;
+    const float speed = speed_of(encoder);
+    const double steps_per_rad = (double)group->steps / revolution;
+    const double angle = (double)(encoder & 0xFFFFFFFF) * (revolution / 4294967296.0);
+    const double steps = angle * steps_per_rad;
+    const int64_t step = (int64_t)steps;
+    const float within = (float)(steps - (double)step);
+    for (int64_t beam = 0; beam < group->beams; beam++) {
+        const float turned = speed * firing_ns[beam];
+        /* While a column is fired, beams may enter the next or the previous cells. */
+        float part = turned * (float)steps_per_rad + within;
+        int64_t further = (int64_t)part;
+        further -= part < (float)further;
+        part -= (float)further;
+        int64_t row = step + further;
+        if (row < 0 || row >= group->steps)
+            row = (row % group->steps + group->steps) % group->steps;
+        const int64_t cell = row * group->beams + beam;
+        azimuth[beam] = group->azimuth_slope[cell] * part + group->azimuth_value[cell]
+            + 2.0f * turned;
+        elevation[beam] = group->elevation_slope[cell] * part + group->elevation_value[cell];
+    }
+}
+
 /* Mirrored: a beam leaves at twice the angle of the rotor past the start of its mirror, whose
    cosine and sine are those of the column, and is corrected by tables over the rotor angle
    (docs/sources/hesai.md section 6). */
 static void project_mirrored(const Group *group, int64_t encoder, int64_t table, int64_t column,
                              Planes *planes)
 {
-    const double revolution = 2 * 3.141592653589793;
-    const int64_t width = group->width, cells = group->steps * group->beams;
-    const float *plane = group->planes, *pose = group->pose;
-    const float *firing_ns = group->firing_ns + table * width;
-    const float speed = speed_of(encoder);
-    const double steps_per_rad = (double)group->steps / revolution;
-    const double angle = (double)(encoder & 0xFFFFFFFF) * (revolution / 4294967296.0);
-    const double step = floor(angle * steps_per_rad);
-    const float within = (float)(angle * steps_per_rad - step);
-    for (int64_t beam = 0; beam < group->beams; beam++) {
-        const float turned = speed * firing_ns[beam];
-        /* While a column is fired, beams may enter the next or the previous cell. */
-        float part = turned * (float)steps_per_rad + within;
-        const float further = floorf(part);
-        part -= further;
-        int64_t cell = (((int64_t)further + (int64_t)step) * group->beams + beam) % cells;
-        cell = cell < 0 ? cell + cells : cell;
-        const float *own = plane + beam;
-        const float azimuth_cosine = own[AZIMUTH_COSINE * width];
-        const float azimuth_sine = own[AZIMUTH_SINE * width];
-        const float past_cosine = group->cosine[column], past_sine = group->sine[column];
-        float cosine = past_cosine * azimuth_cosine - past_sine * azimuth_sine;
-        float sine = past_sine * azimuth_cosine + past_cosine * azimuth_sine;
-        rotate(&cosine, &sine,
-               group->azimuth_slope[cell] * part + group->azimuth_value[cell] + 2.0f * turned);
-        float flat = own[ELEVATION_COSINE * width], up = own[ELEVATION_SINE * width];
-        rotate(&flat, &up, group->elevation_slope[cell] * part + group->elevation_value[cell]);
-        const float right = flat * sine, forward = flat * cosine;
-        for (int64_t axis = 0; axis < 3; axis++) {
-            float *out = planes->xyz[axis];
-            const float *row = pose + 4 * axis;
-            const float towards = right * row[0] + row[1] * forward + row[2] * up;
-            for (int64_t which = 0; which < group->returns; which++) {
-                const int64_t element = which * width + beam;
-                out[element] = planes->range_m[element] * towards + row[3];
-            }
+    float azimuth[MOST_BEAMS] = {0}, elevation[MOST_BEAMS] = {0};
+    const int64_t width = group->width;
+    const float *restrict plane = group->planes;
+    const float *restrict pose = group->pose;
+    const float past_cosine = group->cosine[column], past_sine = group->sine[column];
+    correct_mirrored(group, encoder, group->firing_ns + table * width, azimuth, elevation);
+    for (int64_t which = 0; which < group->returns; which++) {
+        const float *restrict range_m = planes->range_m + which * width;
+        float *restrict x = planes->xyz[0] + which * width;
+        float *restrict y = planes->xyz[1] + which * width;
+        float *restrict z = planes->xyz[2] + which * width;
+        for (int64_t beam = 0; beam < width; beam++) {
+            const float azimuth_cosine = plane[AZIMUTH_COSINE * width + beam];
+            const float azimuth_sine = plane[AZIMUTH_SINE * width + beam];
+            float cosine = past_cosine * azimuth_cosine - past_sine * azimuth_sine;
+            float sine = past_sine * azimuth_cosine + past_cosine * azimuth_sine;
+            rotate(&cosine, &sine, azimuth[beam]);
+            float flat = plane[ELEVATION_COSINE * width + beam];
+            float up = plane[ELEVATION_SINE * width + beam];
+            rotate(&flat, &up, elevation[beam]);
+            const float right = flat * sine, forward = flat * cosine;
+            x[beam] = pose[3]
+                + range_m[beam] * (right * pose[0] + forward * pose[1] + up * pose[2]);
+            y[beam] = pose[7]
+                + range_m[beam] * (right * pose[4] + forward * pose[5] + up * pose[6]);
+            z[beam] = pose[11]
+                + range_m[beam] * (right * pose[8] + forward * pose[9] + up * pose[10]);
         }
     }
 }
