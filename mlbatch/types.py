@@ -189,7 +189,7 @@ class Recording:
     # Part of `size_bytes` that the current pass has read.
     position_bytes: int = field(default=0, kw_only=True)
     # Ignored by containers that have one implementation.
-    engine: str = field(default="numpy", kw_only=True)
+    engine: str = field(default="native", kw_only=True)
 
     def packets(self) -> Generator[PacketBatch, None, None]:
         """Yield all packets from the start, in file order; each call is a new pass.

@@ -26,7 +26,7 @@ OWN = re.compile(
 )
 _NAME = re.compile(r"[^\s/.\\\x00-\x1f\x7f][^/\\\x00-\x1f\x7f]{0,199}")
 # Options that cannot change an output.
-_NOT_IN_KEY = frozenset({"--jobs", "--engine", "--no-fsync"})
+_NOT_IN_KEY = frozenset({"--jobs", "--no-fsync"})
 
 
 @dataclass(frozen=True, slots=True)

@@ -85,7 +85,8 @@ class Batcher:
         """Arguments of a run.
 
         intakes: one a sensor; guards: one a sensor, or none where clocks are not checked; paces:
-        one a sensor, or none where the rates are unknown; merge: None: by numpy.
+        one a sensor, or none where the rates are unknown; merge: shared with
+        the fusion of sweeps, or None.
         """
         self._grid = grid
         self._policy = policy

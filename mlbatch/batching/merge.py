@@ -1,109 +1,105 @@
-"""Columns of all sensors in one order, and their figures, window by window."""
+"""Columns of all sensors in one order, and their figures, window by window: `native/merge.c`."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from itertools import pairwise
 
 import numpy as np
 
-from mlbatch.arrays import I64Array
-from mlbatch.lidar.geometry import SECTORS, sectors
-from mlbatch.types import (
-    NO_COLUMNS,
-    ColumnFigures,
-    Columns,
-    WindowColumns,
-    WindowFigures,
-)
+from mlbatch.lidar.geometry import SECTORS
+from mlbatch.native.library import Part, address, library
+from mlbatch.types import ColumnFigures, Columns, WindowColumns, WindowFigures
 
 _NONE = np.empty(0, np.int64)
+_FIGURES = 7
+# Of a sensor; more, as of packets that come one by one, cost less when they are joined first.
+_MOST_PARTS = 3
 
 
 class ColumnMerge:
-    """Merges the waiting columns of all sensors, by numpy."""
+    """Merges the waiting columns of all sensors."""
 
     def __init__(self, positions: Sequence[int | None]) -> None:
         """positions: rotor positions of a revolution by sensor; None: columns have rotor words."""
-        self._positions = positions
+        self._library = library()
+        self._positions = np.array([one or 0 for one in positions], np.int64)
+        self._entered = np.zeros((len(positions), SECTORS), np.int64)
 
     def take_until(self, waiting: Sequence[list[Columns]], until: int) -> WindowColumns:
         """Take the columns before `until` from the lists of the sensors.
 
-        The stable sort is the merge of the paper: smallest stamp first.
+        The merge of the paper: smallest stamp first; equal ones by sensor, then by delivery.
         """
-        taken = []
         for own in waiting:
-            due, left = split_at(joined(own), until)
-            taken.append(due)
-            own[:] = [left] if len(left) else []
-        merged = joined(taken)
-        sensor = np.arange(len(taken)).repeat([len(columns) for columns in taken])
-        order = merged.stamp_ns.argsort(kind="stable")
-        columns = merged.take(order)
-        return WindowColumns(columns.stamp_ns, sensor[order], columns.ring_index, columns.encoder)
+            if len(own) > _MOST_PARTS:
+                own[:] = [joined(own)]
+        merged = self._taken(waiting, until)
+        if merged is None:
+            # Those of a sensor are not in order: by stamp, equal ones by delivery.
+            for own in waiting:
+                columns = joined(own)
+                own[:] = [columns.take(columns.stamp_ns.argsort(kind="stable"))]
+            merged = self._taken(waiting, until)
+        if merged is None:
+            raise RuntimeError("expected columns in the order of their stamps")
+        return merged
+
+    def _taken(self, waiting: Sequence[list[Columns]], until: int) -> WindowColumns | None:
+        """As `take_until`; None, and nothing taken, if the columns of a sensor are not in order."""
+        parts = [(sensor, one) for sensor, own in enumerate(waiting) for one in own]
+        structs = (Part * len(parts))()
+        kept = []
+        for struct, (sensor, columns) in zip(structs, parts, strict=True):
+            arrays = [
+                np.ascontiguousarray(array)
+                for array in (columns.stamp_ns, columns.ring_index, columns.encoder)
+            ]
+            struct.sensor = sensor
+            struct.columns = len(columns)
+            struct.stamp_ns, struct.ring_index, struct.encoder = map(address, arrays)
+            kept.append(arrays)
+        taken = np.empty(len(parts), np.int64)
+        # One array each, since readers may keep some of them.
+        merged = [np.empty(sum(len(one) for _, one in parts), np.int64) for _ in range(4)]
+        count = self._library.mlbatch_merge(
+            len(parts), structs, until, address(taken), *map(address, merged)
+        )
+        if count < 0:
+            return None
+        for own in waiting:
+            own.clear()
+        for (sensor, columns), used in zip(parts, taken.tolist(), strict=True):
+            if used < len(columns):
+                waiting[sensor].append(columns.take(slice(used, None)))
+        stamp_ns, of, ring_index, encoder = (array[:count] for array in merged)
+        return WindowColumns(stamp_ns, of, ring_index, encoder)
 
     def figures(self, merged: WindowColumns, ends: Sequence[int]) -> list[WindowFigures]:
         """Return the figures of each window; ends: column after the last of each."""
-        bounds = pairwise([0, *ends])
-        return [self._of_window(merged.take(slice(begin, end))) for begin, end in bounds]
-
-    def _of_window(self, columns: WindowColumns) -> WindowFigures:
-        if len(self._positions) == 1:
-            return [_figures(columns.stamp_ns, columns.encoder, self._positions[0])]
-        # One sort of bytes costs less than a mask for each sensor.
-        order = columns.sensor.astype(np.uint8).argsort(kind="stable")
-        stamp_ns = columns.stamp_ns[order]
-        encoder = columns.encoder[order]
-        counts = np.bincount(columns.sensor, minlength=len(self._positions))
-        ends = counts.cumsum().tolist()
-        begins = [0, *ends[:-1]]
-        return [
-            _figures(stamp_ns[begin:end], encoder[begin:end], positions)
-            for begin, end, positions in zip(begins, ends, self._positions, strict=True)
+        sensors = len(self._positions)
+        figures = np.empty((len(ends), sensors, _FIGURES), np.int64)
+        bounds = np.array(ends, np.int64)
+        columns = [
+            np.ascontiguousarray(array)
+            for array in (merged.stamp_ns, merged.sensor, merged.encoder)
         ]
-
-
-def column_merge(engine: str, positions: Sequence[int | None]) -> ColumnMerge:
-    """Return the merge of an engine, numpy or native; positions: as of `ColumnMerge`."""
-    if engine != "native":
-        return ColumnMerge(positions)
-    # Imported on demand: the library may be missing.
-    from mlbatch.batching.native_merge import NativeColumnMerge
-
-    return NativeColumnMerge(positions)
-
-
-def _figures(stamp_ns: I64Array, encoder: I64Array, positions: int | None) -> ColumnFigures:
-    """Figures of the columns (n,) of one sensor; positions: see `sectors`."""
-    if not len(stamp_ns):
-        return NO_COLUMNS
-    gap_ns = int((stamp_ns[1:] - stamp_ns[:-1]).max(initial=0))
-    sector = sectors(encoder, positions)
-    # A sector counts once each time that the rotor enters it.
-    entered = sector[1:][sector[1:] != sector[:-1]]
-    passes = np.bincount(entered, minlength=SECTORS)
-    passes[sector[0]] += 1
-    passed = int(np.count_nonzero(passes))
-    passed_again = int(np.count_nonzero(passes > 1))
-    return ColumnFigures(
-        len(stamp_ns),
-        gap_ns,
-        passed / SECTORS,
-        passed_again / SECTORS,
-        int(stamp_ns[0]),
-        int(stamp_ns[-1]),
-    )
-
-
-def split_at(columns: Columns, until: int) -> tuple[Columns, Columns]:
-    """Columns with stamps before `until`, and the others; each in their order."""
-    stamp = columns.stamp_ns
-    if bool((stamp[1:] >= stamp[:-1]).all()):
-        at = int(stamp.searchsorted(until))
-        return columns.take(slice(None, at)), columns.take(slice(at, None))
-    due = stamp < until
-    return columns.take(due), columns.take(~due)
+        self._library.mlbatch_figures(
+            len(ends),
+            address(bounds),
+            *map(address, columns),
+            sensors,
+            address(self._positions),
+            SECTORS,
+            address(self._entered),
+            address(figures),
+        )
+        return [
+            [
+                ColumnFigures(count, gap_ns, passed / SECTORS, again / SECTORS, first_ns, last_ns)
+                for count, gap_ns, passed, again, first_ns, last_ns, _ in window
+            ]
+            for window in figures.tolist()
+        ]
 
 
 def joined(parts: Sequence[Columns]) -> Columns:

@@ -231,8 +231,7 @@ def is_current(folder: Path, recording: BenchRecording) -> bool:
 
 # -- cases ----------------------------------------------------------------------------------------
 
-AUTO: Final = "auto"
-NUMPY: Final = "numpy"
+OWN: Final = "mlbatch"
 
 
 @dataclass(frozen=True, slots=True)
@@ -241,7 +240,6 @@ class Conversion:
 
     name: str
     recording: str
-    engine: str = AUTO
     # Suffix of a file, or format of a folder; empty: a dry run.
     output: str = ""
     options: tuple[str, ...] = ()
@@ -265,8 +263,8 @@ class Case:
         """The recording that peers read."""
         return RECORDINGS[self.recordings[0]]
 
-    def conversions(self, engines: Sequence[str]) -> list[Conversion]:
-        """Dry runs of each recording by each engine, or a dry run and an output."""
+    def conversions(self) -> list[Conversion]:
+        """Dry runs of each recording, or a dry run and an output."""
         if self.variants:
             return list(self.variants)
         if self.output:
@@ -275,12 +273,8 @@ class Case:
             return [dry, Conversion(self.output, recording, output=self.output, base=DRY_RUN)]
         plain, *fragments = self.recordings
         return [
-            *(Conversion(engine, plain, engine) for engine in engines),
-            *(
-                Conversion(f"{engine}, fragments", recording, engine, base=engine)
-                for recording in fragments
-                for engine in engines
-            ),
+            Conversion(OWN, plain),
+            *(Conversion(f"{OWN}, fragments", one, base=OWN) for one in fragments),
         ]
 
 

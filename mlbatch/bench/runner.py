@@ -61,7 +61,6 @@ class Settings:
     """What to measure."""
 
     cases: tuple[Case, ...]
-    engines: tuple[str, ...]
     seconds: float
     repeat: int
     # Interpreters of environments with peers.
@@ -70,8 +69,6 @@ class Settings:
     keep: Path | None = None
     # Earlier document to compare with.
     against: Path | None = None
-    # Notes on what is not measured.
-    notes: tuple[str, ...] = ()
     progress: Callable[[str], None] = no_progress
 
 
@@ -100,7 +97,7 @@ def bench(settings: Settings) -> Result:
             repeat=settings.repeat,
             rows=tuple(rows),
             ratios=tuple(ratios(rows)),
-            notes=(*settings.notes, *session.notes),
+            notes=tuple(session.notes),
             failed=tuple(session.failed),
             changes=tuple(changes(rows, before)),
         )
@@ -183,7 +180,7 @@ class BenchSession:
 
     def _programs(self, case: Case) -> list[Program]:
         """Conversions first: floors copy and write as many bytes as they did."""
-        conversions = case.conversions(self.settings.engines)
+        conversions = case.conversions()
         for conversion in conversions:
             # Not measured: the first run compiles modules. An error occurs again.
             with contextlib.suppress(BenchError):
@@ -214,7 +211,7 @@ class BenchSession:
         report_path = self.scratch / "report.json"
         command = [sys.executable, "-m", "mlbatch", "convert", str(recording), "--quiet"]
         command += ["--rig", str(folder / RIG), "--report", str(report_path), *conversion.options]
-        command += ["--engine", conversion.engine, *_OUTPUT_OPTIONS[conversion.output]]
+        command += _OUTPUT_OPTIONS[conversion.output]
         usage = measure(conversion.name, command, self.scratch)
         report = json.loads(report_path.read_text(encoding="utf-8"))
         report_path.unlink()

@@ -131,24 +131,24 @@ def root(
     context: typer.Context,
     version: Annotated[bool, typer.Option("--version", help="Show the version.")] = False,
     verbose: Annotated[
-        bool, typer.Option("--verbose", "-v", help="With --version: the engine, too.")
+        bool, typer.Option("--verbose", "-v", help="With --version: the compiled library, too.")
     ] = False,
 ) -> None:
     """Time-consistent merged scans from raw packets of many lidars, offline."""
     if version:
         typer.echo(f"mlbatch {mlbatch.__version__}")
         if verbose:
-            _print_engine()
+            _print_library()
         raise typer.Exit
     if context.invoked_subcommand is None:
         typer.echo(context.get_help(), err=True)
         raise typer.Exit(2)
 
 
-def _print_engine() -> None:
+def _print_library() -> None:
     """Print whether the compiled library can be used, and why not."""
     from mlbatch.native import BUILD_ADVICE
     from mlbatch.native.library import trouble
 
     why = trouble()
-    typer.echo(f"no compiled library: {why}; {BUILD_ADVICE}" if why else "engine native")
+    typer.echo(f"no compiled library: {why}; {BUILD_ADVICE}" if why else "compiled library: found")

@@ -18,7 +18,6 @@ BATCHING_TIMES = ("common", "own")
 INSTANTS = ("start", "middle", "end")
 ALIGN_TO = ("host", "first")
 ON_JUMP = ("error", "split")
-ENGINES = ("auto", "numpy", "native")
 
 
 def convert(
@@ -293,10 +292,7 @@ def convert(
             metavar="N|auto",
         ),
     ] = "auto",
-    engine: Annotated[
-        str,
-        one_of(ENGINES, "--engine", help="Decoder: auto, numpy, or native (compiled)."),
-    ] = "auto",
+    engine: Annotated[str, typer.Option("--engine", hidden=True)] = "",
     strict: Annotated[
         bool, typer.Option("--strict", help="The first rejected packet or warning is an error.")
     ] = False,
@@ -350,7 +346,8 @@ def convert(
         align_to=(align_to, ALIGN_TO),
         on_jump=(on_jump, ON_JUMP),
     )
-    engine = options.engine(engine)
+    if engine:
+        typer.echo("mlbatch: --engine is ignored, since everything is compiled", err=True)
     options.output(output, dry_run=dry_run)
     options.slices(slices)
     options.ranges_m(min_range, max_range)
@@ -394,7 +391,6 @@ def convert(
         passed=tuple(pass_ or ()),
         max_bag_s=check_max_bag_s("--max-bag-duration", max_bag_duration),
         shard=options.shard(shard),
-        engine=engine,
     )
     run(
         check_deskew(check_batching(job), deskew_to is not None),

@@ -48,7 +48,7 @@ GROUPS: Mapping[str, tuple[str, ...]] = {
     ),
     "Clocks": ("clock", "align_clocks", "align_to", "on_jump"),
     "Run": (
-        *("dry_run", "shard", "jobs", "engine", "resume", "strict", "fail_on"),
+        *("dry_run", "shard", "jobs", "resume", "strict", "fail_on"),
         *("fault", "fault_seed", "quiet", "verbose", "help"),
     ),
 }

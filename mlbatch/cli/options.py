@@ -8,11 +8,8 @@ from fractions import Fraction
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import typer
-
 from mlbatch.batching.windows import Limit
 from mlbatch.errors import UsageError
-from mlbatch.native import ALIASES, ENGINES
 from mlbatch.pipeline.job import check_ranges_m, check_slices, wait_ns
 from mlbatch.pipeline.time_limits import limits_of
 from mlbatch.sensors import DECODE_OPTIONS
@@ -91,14 +88,6 @@ def choice(option: str, text: str, allowed: Sequence[str]) -> str:
     raise UsageError(
         f"{option}: expected {' or '.join(allowed)}, found {text!r}; choose one of them"
     )
-
-
-def engine(name: str) -> str:
-    """Check `--engine`; the name of an earlier engine gives its successor, with a note."""
-    if name in ALIASES:
-        typer.echo(f"mlbatch: --engine {name} is now {ALIASES[name]}", err=True)
-        return ALIASES[name]
-    return choice("--engine", name, ENGINES)
 
 
 def percent(option: str, value: float) -> float:

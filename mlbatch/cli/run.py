@@ -344,7 +344,6 @@ def _print_sensors(conversion: Conversion) -> None:
                 f"extrinsics from {sensor.detected.pose.describe()}"
             )
         )
-    typer.echo(f"decoded by {conversion.session.engine}")
 
 
 # -- segments between clock steps -------------------------------------------------------------

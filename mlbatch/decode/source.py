@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from mlbatch.arrays import F64Array
-from mlbatch.decode.arena_ring import ArenaRing
 from mlbatch.decode.packet_ring import PacketRing
 from mlbatch.lidar.interface import Lidar
 
@@ -19,7 +18,7 @@ class Source:
     """
 
     lidar: Lidar
-    ring: PacketRing | ArenaRing
+    ring: PacketRing
     body_from_sensor: F64Array
     ring_base: int
     min_range_m: float = 0.0

@@ -16,7 +16,6 @@ from mlbatch.clocks.compare import SYNCHRONISED, Comparison, compare
 from mlbatch.clocks.host_offset import HostOffset, describe_off
 from mlbatch.clocks.timescale import format_difference, timescale
 from mlbatch.clocks.watch import ClockEstimate, ClockWatch
-from mlbatch.decode.packet_ring import PacketRing
 from mlbatch.discovery.contents import (
     RecordingReport,
     TopicCounter,
@@ -42,6 +41,7 @@ from mlbatch.discovery.types import DetectedSensor, PacketKind
 from mlbatch.errors import RecordingError, RigError
 from mlbatch.readers import merge, open_recordings
 from mlbatch.readers.bag.clouds import CloudRecording
+from mlbatch.readers.byte_records import rows
 from mlbatch.rig.rig import (
     DEFAULT_BODY_FRAME,
     Rig,
@@ -435,7 +435,6 @@ class _Measured:
     def __init__(self, sensor: DetectedSensor) -> None:
         lidar = sensor.lidar
         packet_ns = lidar.columns_per_packet * lidar.column_period_ns
-        self.ring = PacketRing(lidar.packet_size, lidar.records)
         self.loss = PacketLoss(lidar.sequence_modulus, packet_ns)
         self.watch: ClockWatch = clock_watch(lidar)
         self.first: tuple[int, int] | None = None
@@ -518,7 +517,7 @@ def _measure(
             for sensor in owners:
                 lidar = sensor.lidar
                 one = measured[sensor]
-                packets, _ = one.ring.store(batch.data, batch.start[index], None)
+                packets = rows(batch.data, batch.start[index], lidar.packet_size)
                 own = lidar.sent_by_me(packets)
                 owned |= own
                 if own.any():

@@ -1,4 +1,4 @@
-"""Compiled loops for what numpy does in many passes: the engine `native`.
+"""Compiled loops over packets, columns and points.
 
 C functions (`native.h`) over plain arrays, built when the package is installed
 (`.ci/build_library.py`) and called through ctypes.
@@ -11,9 +11,6 @@ from pathlib import Path
 
 from mlbatch.errors import UsageError
 
-ENGINES = ("auto", "numpy", "native")
-# Names of earlier versions.
-ALIASES = {"numba": "native"}
 BUILD_ADVICE = "reinstall mlbatch, which compiles it"
 
 
@@ -27,14 +24,10 @@ def library_path() -> Path | None:
     return path if path.is_file() else None
 
 
-def choose_engine(name: str) -> str:
-    """`numpy` or `native`: what reads headers and merges columns; name: one of ENGINES.
-
-    Points are always decoded by the compiled library: UsageError if it cannot be loaded.
-    """
+def require_library() -> None:
+    """Raise UsageError if the compiled library cannot be loaded."""
     from mlbatch.native.library import trouble
 
     why = trouble()
     if why:
         raise UsageError(f"expected the compiled library of mlbatch, found {why}; {BUILD_ADVICE}")
-    return "numpy" if ALIASES.get(name, name) == "numpy" else "native"

@@ -18,7 +18,7 @@ class PacketArena:
     the old one stays as it is for those who have it.
 
     data: `capacity` bytes and spare ones; origin: a place that is byte 0 of `data`;
-    read_bytes: to read at a time, 0: as the reader likes.
+    read_bytes: to read at a time, 0: as the reader likes; oldest: first place still needed.
     """
 
     def __init__(self, read_bytes: int = 0) -> None:
@@ -27,14 +27,13 @@ class PacketArena:
         self.capacity = 0
         self.origin = 0
         self._next = 0
-        # First place that decoding still needs.
-        self._oldest = 0
+        self.oldest = 0
         # First place of the region that is being read.
         self._reading: int | None = None
 
     def keep_from(self, oldest: int | None) -> None:
         """Free all before `oldest`, None: all so far; what is reserved later stays."""
-        self._oldest = self._next if oldest is None else oldest
+        self.oldest = self._next if oldest is None else oldest
 
     def reserve(self, count: int) -> tuple[U8Array, int]:
         """Return a region of `count` bytes, with any content, and the place of the first."""
@@ -44,7 +43,7 @@ class PacketArena:
             if count > self.capacity - begin:
                 at += self.capacity - begin
                 begin = 0
-            oldest = min(self._oldest, at if self._reading is None else self._reading)
+            oldest = min(self.oldest, at if self._reading is None else self._reading)
             if at + count - oldest <= self.capacity:
                 self._next = at + count
                 return self.data[begin : begin + count], at

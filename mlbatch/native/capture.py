@@ -85,7 +85,12 @@ class CaptureLoops:
         )
 
     def sums(self, data: U8Array, start: I64Array, size: int) -> U64Array:
-        """Return the checksums (n,) of packets of a size; as `packet_ring.packet_sums`."""
+        """Return the checksums (n,) of packets of a size: sums of their 64-bit words, modulo 2^64.
+
+        Of a size that is no multiple of 8, the last 8 bytes are a word as well; of less than 8, the
+        bytes are summed. Every change of a single byte changes the sum; words that change places
+        do not.
+        """
         found = np.empty(len(start), np.uint64)
         if not len(start):
             return found

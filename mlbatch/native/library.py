@@ -61,6 +61,7 @@ _WITHOUT_RESULT = (
     "mlbatch_gather",
     "mlbatch_sums",
     "mlbatch_cloud_pack",
+    "mlbatch_figures",
 )
 
 

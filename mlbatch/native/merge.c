@@ -33,7 +33,7 @@ static inline int64_t head_of(const Part *parts, int64_t *next, int64_t end, int
 
 /* Merge the columns before `until_ns` by stamp, then by sensor, then in their order. Parts come by
    sensor; taken (parts,): columns taken of each. Return the number of columns, -1 if those of a
-   sensor are not in order. */
+   sensor are not in order, or are of more than MOST_SENSORS. */
 EXPORT int64_t mlbatch_merge(int64_t part_count, const Part *parts, int64_t until_ns,
                              int64_t *taken, int64_t *stamp_ns, int64_t *sensor,
                              int64_t *ring_index, int64_t *encoder)
@@ -43,8 +43,11 @@ EXPORT int64_t mlbatch_merge(int64_t part_count, const Part *parts, int64_t unti
     int64_t sensors = 0, count = 0;
     for (int64_t part = 0; part < part_count; part++) {
         taken[part] = 0;
-        if (part == 0 || parts[part].sensor != parts[part - 1].sensor)
+        if (part == 0 || parts[part].sensor != parts[part - 1].sensor) {
+            if (sensors == MOST_SENSORS)
+                return -1;
             next[sensors++] = part;
+        }
         end[sensors - 1] = part + 1;
     }
     for (int64_t one = 0; one < sensors; one++) {
@@ -87,21 +90,24 @@ EXPORT int64_t mlbatch_merge(int64_t part_count, const Part *parts, int64_t unti
     return count;
 }
 
-/* Rotor positions are a share of `positions`; 0: rotor words, 2**32 ticks a revolution. */
+/* Rotor positions are a share of `positions`, and those beyond it are at its ends; 0: rotor words,
+   2**32 ticks a revolution. */
 static int64_t sector_of(int64_t encoder, int64_t positions, int64_t sectors)
 {
-    if (positions)
-        return encoder * sectors / positions;
-    return (encoder & INT64_C(0xFFFFFFFF)) * sectors >> 32;
+    if (!positions)
+        return (encoder & INT64_C(0xFFFFFFFF)) * sectors >> 32;
+    if (encoder < 0)
+        return 0;
+    return encoder < positions ? encoder * sectors / positions : sectors - 1;
 }
 
 /* Figures (windows, sensors, FIGURES) of the columns of some windows; ends (windows,): column
    after the last of each; positions (sensors,): see `sector_of`; entered (sensors, sectors):
-   scratch. Return 1 if a position is outside of the revolution, so that numpy computes them. */
-EXPORT int64_t mlbatch_figures(int64_t windows, const int64_t *ends, const int64_t *stamp_ns,
-                               const int64_t *sensor, const int64_t *encoder, int64_t sensors,
-                               const int64_t *positions, int64_t sectors, int64_t *entered,
-                               int64_t *figures)
+   scratch. */
+EXPORT void mlbatch_figures(int64_t windows, const int64_t *ends, const int64_t *stamp_ns,
+                            const int64_t *sensor, const int64_t *encoder, int64_t sensors,
+                            const int64_t *positions, int64_t sectors, int64_t *entered,
+                            int64_t *figures)
 {
     memset(figures, 0, (size_t)(windows * sensors * FIGURES) * sizeof *figures);
     int64_t column = 0;
@@ -109,11 +115,7 @@ EXPORT int64_t mlbatch_figures(int64_t windows, const int64_t *ends, const int64
         memset(entered, 0, (size_t)(sensors * sectors) * sizeof *entered);
         for (; column < ends[window]; column++) {
             const int64_t number = sensor[column];
-            if (encoder[column] < 0 && positions[number])
-                return 1;
             const int64_t sector = sector_of(encoder[column], positions[number], sectors);
-            if (sector < 0 || sector >= sectors)
-                return 1;
             int64_t *own = figures + number * FIGURES;
             if (own[NUMBER] == 0) {
                 own[FIRST] = stamp_ns[column];
@@ -135,5 +137,4 @@ EXPORT int64_t mlbatch_figures(int64_t windows, const int64_t *ends, const int64
                 figures[number * FIGURES + AGAIN] += times > 1;
             }
     }
-    return 0;
 }

@@ -404,10 +404,10 @@ EXPORT int64_t mlbatch_angles(int64_t count, const int64_t *words, float *cosine
 EXPORT int64_t mlbatch_merge(int64_t part_count, const Part *parts, int64_t until_ns,
                              int64_t *taken, int64_t *stamp_ns, int64_t *sensor,
                              int64_t *ring_index, int64_t *encoder);
-EXPORT int64_t mlbatch_figures(int64_t windows, const int64_t *ends, const int64_t *stamp_ns,
-                               const int64_t *sensor, const int64_t *encoder, int64_t sensors,
-                               const int64_t *positions, int64_t sectors, int64_t *entered,
-                               int64_t *figures);
+EXPORT void mlbatch_figures(int64_t windows, const int64_t *ends, const int64_t *stamp_ns,
+                            const int64_t *sensor, const int64_t *encoder, int64_t sensors,
+                            const int64_t *positions, int64_t sectors, int64_t *entered,
+                            int64_t *figures);
 EXPORT int64_t mlbatch_stamped(const StampedLayout *layout, const uint8_t *data, int64_t packets,
                                const int64_t *start, int64_t *key, int64_t *stamp_ns,
                                int64_t *encoder);

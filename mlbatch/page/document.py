@@ -502,7 +502,6 @@ def _about(report: Values) -> str:
         for key in ("wall_s", "cpu_s", "read_s", "decode_s", "merge_s", "write_s", "peak_rss_mb")
         if (value := timing.number(key)) is not None
     ]
-    costs += [("engine", timing.text("engine"))] if timing.text("engine") else []
     topics = [
         (one.text("topic"), f"{one.count('read'):,}", f"{one.count('written'):,}")
         for one in report.items("messages")

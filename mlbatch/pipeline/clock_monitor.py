@@ -16,6 +16,7 @@ from mlbatch.clocks.watch import ClockEstimate
 from mlbatch.discovery.router import Router
 from mlbatch.discovery.sampler import clock_watch
 from mlbatch.discovery.types import Note
+from mlbatch.native.arena import PacketArena
 from mlbatch.pipeline.ingest import Ingest
 from mlbatch.pipeline.sensor import Sensor
 from mlbatch.types import PacketBatch
@@ -63,14 +64,15 @@ class ClockMonitor:
         from mlbatch.clocks.align import fit
 
         # Rings and ledgers of their own: this pass reads everything once more.
-        sensors = [sensor.unread() for sensor in self._sensors]
+        arena = PacketArena()
+        sensors = [sensor.unread(arena) for sensor in self._sensors]
         watches = [clock_watch(sensor.lidar) for sensor in sensors]
         ingest = Ingest(router, sensors, self.map_stamps)
         if self._replay is not None:
             batches = self._replay.batches(batches, ingest.owners)
-        nothing_kept = [None] * len(sensors)
         for batch in batches:
-            arrivals = ingest.columns(batch, nothing_kept).arrivals
+            arena.keep_from(None)
+            arrivals = ingest.columns(batch).arrivals
             for arrival, watch in zip(arrivals, watches, strict=True):
                 if arrival is not None:
                     _, newest_ns = extremes(arrival.headers)

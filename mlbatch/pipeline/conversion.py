@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, NamedTuple, TypeVar
 
 from mlbatch.batching.batcher import SLACK_NS, Batcher
 from mlbatch.batching.grid import Grid
-from mlbatch.batching.merge import column_merge
+from mlbatch.batching.merge import ColumnMerge
 from mlbatch.batching.windows import OWN, Policy, Window
 from mlbatch.clocks.host_offset import remedies
 from mlbatch.clocks.timescale import common_timescale
@@ -112,7 +112,7 @@ class Conversion:
         rate = job.rate or (rig.rate if rig is not None else None) or DEFAULT_RATE
         self.grid = Grid(rate, job.slices)
         paces = [sensor.pace() for sensor in self.sensors]
-        merge = column_merge(self.session.engine, [pace.positions for pace in paces])
+        merge = ColumnMerge([pace.positions for pace in paces])
         self.batcher = Batcher(
             self.grid,
             [sensor.intake() for sensor in self.sensors],
@@ -211,11 +211,10 @@ class Conversion:
         if progress is not None:
             # A pass begins: that of `--align-clocks` came before.
             progress(0, self.session.size_bytes, 0)
-        oldest_ring_indexes = self._oldest_ring_indexes()
         with contextlib.closing(self.session.packets()) as packets:
             for batch in self.stages.each("read_s", packets):
                 # Steps 1 and 2: the sensor of each packet, the timestamps of its columns.
-                ingested = self.session.ingest.columns(batch, oldest_ring_indexes)
+                ingested = self.session.ingest.columns(batch)
                 if self.deskew is not None:
                     self.deskew.add(ingested.imu, batch.messages)
                 self.passthrough.add(ingested.imu, batch.messages, self.batcher.limits_ns)
@@ -227,8 +226,7 @@ class Conversion:
                     progress(self.session.position_bytes, self.session.size_bytes, scans)
                 if self.batcher.past_end and not self._awaits_poses():
                     break
-                oldest_ring_indexes = self._oldest_ring_indexes()
-                self.session.keep_from(oldest_ring_indexes)
+                self.session.keep_from(self._oldest_ring_indexes())
         self.session.refuse_apart()
         # Step 5: end of input; no sensor is waited for.
         yield from self.batcher.finish(self.session.last_host_ns)

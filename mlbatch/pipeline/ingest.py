@@ -16,7 +16,7 @@ from mlbatch.discovery.sampler import SAMPLES_PER_KIND, split_by_kind
 from mlbatch.discovery.types import PacketKind
 from mlbatch.lidar.interface import FAULTS
 from mlbatch.pipeline.sensor import Sensor
-from mlbatch.readers.byte_records import records
+from mlbatch.readers.byte_records import rows
 from mlbatch.sensors import content_keys
 from mlbatch.types import ImuSamples, PacketBatch
 
@@ -97,11 +97,8 @@ class Ingest:
         self._stamp_map = stamp_map
         self._recent_imu: list[I64Array] = [np.empty(0, np.int64) for _ in self._sensors]
 
-    def columns(self, batch: PacketBatch, oldest_ring_indexes: Sequence[int | None]) -> Ingested:
-        """Route a batch, copy lidar packets to their rings and read their column headers.
-
-        oldest_ring_indexes: first ring index that is still needed, of each sensor.
-        """
+    def columns(self, batch: PacketBatch) -> Ingested:
+        """Route a batch, keep lidar packets in their rings and read their column headers."""
         own: list[list[I64Array]] = [[] for _ in self._sensors]
         ingested = Ingested([None] * len(self._sensors), [])
         owned = np.zeros(len(batch), bool)
@@ -122,12 +119,10 @@ class Ingest:
                 packets.reject("bad_size", len(index))
             else:
                 unassigned.append((kind, index))
-        for sensor, parts, oldest_ring_index in zip(
-            self._sensors, own, oldest_ring_indexes, strict=True
-        ):
+        for sensor, parts in zip(self._sensors, own, strict=True):
             if parts:
                 index = parts[0] if len(parts) == 1 else np.sort(np.concatenate(parts))
-                arrival = self._arrive(sensor, batch, index, owned, oldest_ring_index)
+                arrival = self._arrive(sensor, batch, index, owned)
                 ingested.arrivals[sensor.index] = arrival
         if not owned.all():
             unassigned += [(kind, index[~owned[index]]) for kind, index in shared]
@@ -170,15 +165,10 @@ class Ingest:
         known.add(batch, index)
 
     def _arrive(
-        self,
-        sensor: Sensor,
-        batch: PacketBatch,
-        index: I64Array,
-        owned: BoolArray,
-        oldest_ring_index: int | None,
+        self, sensor: Sensor, batch: PacketBatch, index: I64Array, owned: BoolArray
     ) -> Arrival:
-        """Copy packets that may be of a sensor to its ring; give those that are, and are valid."""
-        kept = sensor.ring.keep(batch.data, batch.start[index], oldest_ring_index, batch.place)
+        """Keep packets that may be of a sensor; give those that are, and are valid."""
+        kept = sensor.ring.keep(batch.data, batch.start[index], batch.place)
         usual = self._arrive_usual(sensor, batch, index, owned, kept)
         if usual is not None:
             return usual
@@ -246,8 +236,7 @@ class Ingest:
         """Samples of IMU packets; duplicates are counted and left out."""
         ledger = sensor.ledger
         ledger.imu_packets += len(index)
-        layout = np.dtype([("byte", "u1", int(batch.size[index[0]]))])
-        payloads = records(batch.data, layout, batch.start[index])["byte"]
+        payloads = rows(batch.data, batch.start[index], int(batch.size[index[0]]))
         fresh = self._fresh_imu(sensor, content_keys(payloads))
         if not fresh.all():
             again = len(sensor.lidar.imu(payloads[~fresh], sensor.index).stamp_ns)

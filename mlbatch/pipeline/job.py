@@ -66,7 +66,6 @@ class Job:
     max_bag_s: float = 0.0  # recorded time in a file of a ROS 2 bag, s; 0: all in one file
     shard: Shard | None = None  # the only scans to make; None: all
     jobs: int = 1  # scans made at the same time
-    engine: str = "auto"  # one of `native.ENGINES`
 
     @property
     def is_fused(self) -> bool:

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 # Fields of a job that are not part of its identity: digests of files and sensors replace them, or
 # the output does not depend on them.
 _NOT_IDENTITY = frozenset(
-    {"recordings", "selection", "segment", "extras", "record", "fault_begin_ns", "jobs", "engine"}
+    {"recordings", "selection", "segment", "extras", "record", "fault_begin_ns", "jobs"}
 )
 # What decoding takes from a calibration, apart from `beams`; see `Lidar`.
 _CALIBRATED = (

@@ -333,7 +333,6 @@ def _timing(parts: Sequence[Part], report: RunReport, began_s: tuple[float, floa
     known = [timing for timing in shards if timing is not None]
     own_s = time.perf_counter() - began_s[0]
     wall_s = max(timing.wall_s for timing in known) + own_s
-    engines = dict.fromkeys(timing.engine for timing in known)
     own_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / _KB_PER_MB
     return Timing(
         wall_s=wall_s,
@@ -345,5 +344,4 @@ def _timing(parts: Sequence[Part], report: RunReport, began_s: tuple[float, floa
         recorded_s=known[0].recorded_s,
         points_per_s=report.scans.points / wall_s if wall_s > 0 else 0.0,
         peak_rss_mb=max(own_mb, *(timing.peak_rss_mb for timing in known)),
-        engine=", ".join(engines),
     )

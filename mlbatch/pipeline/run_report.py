@@ -490,5 +490,4 @@ def _timing(run: Conversion) -> Timing:
         recorded_s=run.session.recorded_s,
         points_per_s=points / wall_s if wall_s > 0 else 0.0,
         peak_rss_mb=resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / _KB_PER_MB,
-        engine=run.session.engine,
     )

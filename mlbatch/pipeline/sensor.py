@@ -10,7 +10,7 @@ from mlbatch.batching.fill import Pace
 from mlbatch.batching.intake import Intake
 from mlbatch.clocks.timescale import timescale
 from mlbatch.clocks.watch import ClockWatch
-from mlbatch.decode.arena_ring import ArenaRing
+from mlbatch.decode.native_headers import HeaderLoops
 from mlbatch.decode.packet_ring import PacketRing
 from mlbatch.decode.source import Source
 from mlbatch.discovery.types import DetectedSensor
@@ -23,7 +23,6 @@ from mlbatch.units import NS_PER_S
 
 if TYPE_CHECKING:
     from mlbatch.clocks.align import ClockMap
-    from mlbatch.decode.native_headers import HeaderLoops
 
 
 @dataclass(slots=True)
@@ -69,7 +68,7 @@ class Sensor:
     limits: Limits
     ring_base: int  # first ring number of its channels
     columns_per_s: float | None  # nominal rate, None if unknown
-    ring: PacketRing | ArenaRing  # raw packets until their window closes
+    ring: PacketRing  # raw packets until their window closes
     loops: HeaderLoops | None  # read headers that are as usual; None: numpy reads all
     ledger: SensorLedger = field(default_factory=SensorLedger)
 
@@ -139,23 +138,16 @@ class Sensor:
             self.limits.keep_repeated,
         )
 
-    def unread(self) -> Sensor:
+    def unread(self, arena: PacketArena) -> Sensor:
         """The same sensor with an empty ring and ledger, for a pass of its own."""
-        return replace(self, ring=new_ring(self.lidar), ledger=SensorLedger())
+        return replace(self, ring=new_ring(self.lidar, arena), ledger=SensorLedger())
 
 
-def header_loops(lidar: Lidar, engine: str) -> HeaderLoops | None:
-    """Compiled loops for the headers of a lidar's packets; None if it has none, or engine numpy."""
-    if engine != "native" or lidar.headers is None:
-        return None
-    # Imported on demand: the library may be missing.
-    from mlbatch.decode.native_headers import HeaderLoops
-
-    return HeaderLoops(lidar.headers)
+def header_loops(lidar: Lidar) -> HeaderLoops | None:
+    """Compiled loops for the headers of a lidar's packets; None if it has none."""
+    return None if lidar.headers is None else HeaderLoops(lidar.headers)
 
 
-def new_ring(lidar: Lidar, arena: PacketArena | None = None) -> PacketRing | ArenaRing:
-    """An empty ring for packets of a lidar; arena: into which the recording is read, or None."""
-    if arena is None:
-        return PacketRing(lidar.packet_size, lidar.records)
-    return ArenaRing(lidar.packet_size, lidar.records, lidar.header_bytes, arena)
+def new_ring(lidar: Lidar, arena: PacketArena) -> PacketRing:
+    """An empty ring for packets of a lidar."""
+    return PacketRing(lidar.packet_size, lidar.records, lidar.header_bytes, arena)

@@ -16,7 +16,7 @@ from mlbatch.discovery.probe import is_without_packets
 from mlbatch.discovery.sampler import clock_watch
 from mlbatch.discovery.types import DetectedSensor, Note, PacketKind
 from mlbatch.errors import RecordingError
-from mlbatch.native import choose_engine
+from mlbatch.native import require_library
 from mlbatch.native.arena import PacketArena
 from mlbatch.pipeline.clock_monitor import ClockMonitor
 from mlbatch.pipeline.ingest import Ingest
@@ -49,7 +49,7 @@ _MOST_READ_BYTES = 8 << 20
 class Session:
     """The recordings of a job and the sensors found in them.
 
-    engine: `numpy` or `native`; setup: result of discovery; sensors: in the order of `lidar_id`;
+    setup: result of discovery; sensors: in the order of `lidar_id`;
     replay: of injected faults, or None; delivered: packets given by `packets` so far; notes:
     warnings so far.
     """
@@ -61,24 +61,20 @@ class Session:
         self.notes: list[Note] = []
         self._received_ns: tuple[int, int] | None = None
         self._overlap: RunOverlap | None = None
+        require_library()
         streams = StreamTable()
         opened = open_recordings(job.recordings, streams, job.selection.rig)
-        self.engine = choose_engine(job.engine)
-        for recording in opened:
-            recording.use_engine(self.engine)
         if job.segment != TimeSegment():
             opened = [ClippedRecording(recording, job.segment) for recording in opened]
         self.setup: Discovery = discover(opened, streams, job.selection)
         self.recordings: Sequence[Recording] = self.setup.recordings
-        # The compiled engine decodes packets where they were read, unless most bytes there are
-        # of others, which would be kept as long.
         kinds = {kind for found in self.setup.sensors for kind in found.kinds}
-        is_mostly_lidar = self.setup.sampler.share_of(kinds) >= _MOST
-        self._arena: PacketArena | None = None
-        if self.engine == "native" and is_mostly_lidar:
-            sizes = [found.lidar.packet_size for found in self.setup.sensors]
-            read_bytes = _READ_PACKETS * sum(sizes)
-            self._arena = PacketArena(min(max(read_bytes, BUFFER_BYTES), _MOST_READ_BYTES))
+        sizes = [found.lidar.packet_size for found in self.setup.sensors]
+        read_bytes = _READ_PACKETS * sum(sizes)
+        self._arena = PacketArena(min(max(read_bytes, BUFFER_BYTES), _MOST_READ_BYTES))
+        # Packets are decoded where they were read, unless most bytes there are of others, which
+        # would be kept as long.
+        self._reads_into_arena = self.setup.sampler.share_of(kinds) >= _MOST
         self.sensors: list[Sensor] = []
         for found in self.setup.sensors:
             self.sensors.append(self._sensor(found))
@@ -136,7 +132,7 @@ class Session:
             ring_base=ring_base,
             columns_per_s=sampler.columns_per_s(found),
             ring=new_ring(lidar, self._arena),
-            loops=header_loops(lidar, self.engine),
+            loops=header_loops(lidar),
         )
 
     def _replay(self) -> FaultReplay | None:
@@ -155,9 +151,8 @@ class Session:
 
     def keep_from(self, oldest_ring_indexes: Sequence[int | None]) -> None:
         """Free the packets before those that are still needed; by sensor, None: it needs none."""
-        if self._arena is not None:
-            needed = [index for index in oldest_ring_indexes if index is not None]
-            self._arena.keep_from(min(needed, default=None))
+        needed = [index for index in oldest_ring_indexes if index is not None]
+        self._arena.keep_from(min(needed, default=None))
 
     def packets(self) -> Generator[PacketBatch, None, None]:
         """Yield all packets in receive order, with injected faults."""
@@ -168,7 +163,7 @@ class Session:
             from mlbatch.pipeline.overlap import RunOverlap
 
             self._overlap = RunOverlap(self.recordings, self.setup)
-        elif self._arena is not None and self.replay is None:
+        elif self._reads_into_arena and self.replay is None:
             self.recordings[0].use_arena(self._arena)
         seen = None if self._overlap is None else self._overlap.add
         with contextlib.closing(merge(self.recordings, is_without_packets, seen)) as merged:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import difflib
 import inspect
 import math
+import warnings
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
 from fractions import Fraction
@@ -14,7 +15,6 @@ from typing import Any, Literal, TypeAlias, TypedDict, TypeVar
 
 from mlbatch.discovery.discover import SensorSelection
 from mlbatch.errors import UsageError
-from mlbatch.native import ALIASES, ENGINES
 from mlbatch.pipeline.job import (
     Job,
     check_batching,
@@ -96,7 +96,6 @@ class SessionOptions(TypedDict, total=False):
     align_to: str
     decode: Mapping[str, str] | None
     strict: bool
-    engine: str
 
 
 class WindowOptions(TypedDict, total=False):
@@ -155,6 +154,10 @@ def check_names(call: str, options: Mapping[str, object], *tables: type) -> None
     """Raise UsageError for an option that a function does not have."""
     known = sorted(_names_of(tables))
     for name in options:
+        if name == "engine":
+            text = f"{call}: engine is ignored, since everything is compiled; leave it out"
+            warnings.warn(text, DeprecationWarning, stacklevel=3)
+            continue
         if name not in known:
             close = difflib.get_close_matches(name, known, 1)
             remedy = f"write {close[0]}, or see" if close else "see"
@@ -187,7 +190,6 @@ def _names_of(tables: Iterable[type]) -> list[str]:
 def session_job(recordings: Paths | tuple[Paths, ...], options: SessionOptions) -> Job:
     """The options that select recordings and sensors; those of windows have their defaults."""
     clock = choice("clock", options.get("clock", "sensor"), ("sensor", "host"))
-    engine = choice("engine", options.get("engine", "auto"), (*ENGINES, *ALIASES))
     align_to = choice("align_to", options.get("align_to", "host"), ("host", "first"))
     aligned = options.get("align_clocks", False)
     several = recordings if isinstance(recordings, tuple) else (recordings,)
@@ -208,7 +210,6 @@ def session_job(recordings: Paths | tuple[Paths, ...], options: SessionOptions) 
         ),
         align_clocks_to=align_to if aligned else "",
         strict=options.get("strict", False),
-        engine=ALIASES.get(engine, engine),
     )
 
 

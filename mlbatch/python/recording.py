@@ -19,7 +19,7 @@ from mlbatch.batching.grid import Grid
 from mlbatch.batching.windows import Limit
 from mlbatch.discovery.discover import Discovery, discover
 from mlbatch.errors import NoScanError, RecordingError, UsageError
-from mlbatch.native import choose_engine
+from mlbatch.native import require_library
 from mlbatch.outputs.scan import Scan
 from mlbatch.outputs.table import Rows, read_table
 from mlbatch.pipeline.conversion import Conversion
@@ -115,11 +115,9 @@ class Recording:
         return self.job.recordings
 
     def _discover(self) -> Discovery:
+        require_library()
         table = StreamTable()
         opened = open_recordings(self.job.recordings, table, self.job.selection.rig)
-        engine = choose_engine(self.job.engine)
-        for recording in opened:
-            recording.use_engine(engine)
         return discover(opened, table, replace(self.job.selection, identity_extrinsics=True))
 
     # -- description --------------------------------------------------------------------------
@@ -275,10 +273,10 @@ class Recording:
         session = Session(self._without_poses())
         ingest: Ingest = session.ingest
         offset_ns = session.sensors[number].clock.imu_offset_ns
-        nothing: list[int | None] = [None] * len(session.sensors)
         with contextlib.closing(session.packets()) as batches:
             for batch in batches:
-                for samples in ingest.columns(batch, nothing).imu:
+                session.keep_from(())
+                for samples in ingest.columns(batch).imu:
                     if samples.sensor == number and len(samples.stamp_ns):
                         samples.stamp_ns = samples.stamp_ns + offset_ns
                         yield samples

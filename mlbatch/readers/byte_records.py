@@ -25,6 +25,12 @@ def records(data: U8Array, layout: np.dtype[np.void], at: I64Array) -> Records:
     return windows[at].view(layout)
 
 
+def rows(data: U8Array, start: I64Array, size: int) -> U8Array:
+    """Copies (n, size) of the bytes from each `start` on; all must be within `data`."""
+    found: U8Array = records(data, np.dtype([("byte", "u1", (size,))]), start)["byte"]
+    return found
+
+
 def single(value: int) -> I64Array:
     """A number as (1,) int64."""
     return np.array([value], np.int64)

@@ -91,7 +91,7 @@ class Timing(NamedTuple):
     recorded_s: float  # length of the recording
     points_per_s: float
     peak_rss_mb: float
-    engine: str  # numpy or native
+    engine: str = "native"  # earlier versions had others
 
     @property
     def realtime_factor(self) -> float:

@@ -171,7 +171,7 @@ CONVERT: tuple[Key[Values], ...] = (
     _texts_key("fault", "faults to inject"),
     Key("fault_seed", _whole(0, 2**31), (), whole_form(0, 2**31), "seed of random faults"),
     Key("jobs", _jobs, (), _JOBS, "scans made in parallel, auto: by cores and format"),
-    _choice_key("engine", "decoder", "auto", "numpy", "native"),
+    _choice_key("engine", "ignored", "auto", "numpy", "native"),
     _flag_key("strict", "the first rejected packet or warning is an error"),
     _texts_key("fail_on", "limits beyond which the exit code is 3"),
     _flag_key("no_fsync", "do not wait until the output is on the disk"),

@@ -15,10 +15,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mlbatch.batching.reference import FeedPacket, Settings, reference_scans
 from tests.builders.fast import run_fast
 from tests.builders.hand import MS, TEN_HZ, by_host, packet
 from tests.contract.tree import ROOT
+from tests.reference.batching import FeedPacket, Settings, reference_scans
 
 DOCS = ROOT / "docs"
 SECOND = 10**9

@@ -13,11 +13,11 @@ from itertools import pairwise
 import pytest
 from hypothesis import given, settings
 
-from mlbatch.batching.reference import FeedPacket, Outcome, Settings, reference_scans
 from mlbatch.errors import ClockError
 from tests.builders.fast import run_fast
 from tests.builders.feeds import Case, feeds
 from tests.builders.hand import MS, TEN_HZ, TWO, at_index, by_host, every, masked, packet, spans
+from tests.reference.batching import FeedPacket, Outcome, Settings, reference_scans
 
 HOUR_MS = 3_600_000
 

@@ -1,6 +1,6 @@
 """Latency from the receive time of a packet to the sub-scan that it completes.
 
-    python -m tests.bench.latency RECORDING --rig RIG --slices 10 --engine native
+    python -m tests.bench.latency RECORDING --rig RIG --slices 10
 
 Packets are pushed one by one, as from a driver on the vehicle, through the classes of a conversion:
 `Ingest.columns`, `Batcher.push`, `DecodeWorker.decode`. Garbage collection is on. CPU time of the
@@ -22,7 +22,6 @@ import numpy as np
 
 from mlbatch.arrays import BoolArray
 from mlbatch.discovery.discover import SensorSelection
-from mlbatch.native import ENGINES
 from mlbatch.pipeline.conversion import Conversion
 from mlbatch.pipeline.decode_pool import DecodePool
 from mlbatch.pipeline.job import Job
@@ -63,7 +62,7 @@ class Driver:
         batcher = self.run.batcher
         oldest = [batcher.oldest_ring_index(sensor.index) for sensor in self.run.sensors]
         self.run.session.keep_from(oldest)
-        ingested = self.run.session.ingest.columns(batch, oldest)
+        ingested = self.run.session.ingest.columns(batch)
         scans = 0
         for window in batcher.push(ingested.arrivals, batch.host_ns):
             self._pool = self._pool or self.run.pool
@@ -125,13 +124,12 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("recording", type=Path)
     parser.add_argument("--rig", type=Path)
     parser.add_argument("--slices", type=int, default=10)
-    parser.add_argument("--engine", choices=ENGINES, default="numpy")
     parser.add_argument("--warm", type=int, default=2000, help="packets before the first measured")
     parser.add_argument("--packets", type=int, default=20_000, help="packets that are measured")
     parser.add_argument("--json", action="store_true")
     options = parser.parse_args(arguments)
     selection = SensorSelection(rig=options.rig)
-    job = Job((options.recording,), selection, slices=options.slices, engine=options.engine)
+    job = Job((options.recording,), selection, slices=options.slices)
     found = figures(measure(job, options.warm, options.packets))
     if options.json:
         print(json.dumps({name: asdict(one) for name, one in found.items()}))

@@ -40,7 +40,7 @@ def test_the_measuring_process_imports_no_large_package() -> None:
     """Its pages count in the memory of measured processes."""
     loaded = run_python(
         "import sys\nimport mlbatch.cli.bench as bench\n"
-        "bench.settings_from(1.0, 1, [], 'all', [], None, None)\n"
+        "bench.settings_from(1.0, 1, [], [], None, None)\n"
         "print([name for name in ('numpy', 'mcap', 'yaml') if name in sys.modules])"
     )
     assert loaded.strip() == "[]"

@@ -23,7 +23,7 @@ def test_programs_alternate_in_both_directions(
     monkeypatch.setattr(runner.BenchSession, "_convert", record)
     pair = (Conversion("a", "three-vlp16"), Conversion("b", "three-vlp16"))
     case = Case("small", ("three-vlp16",), "", (), pair)
-    settings = runner.Settings((case,), ("numpy",), 1.0, 3, keep=tmp_path)
+    settings = runner.Settings((case,), 1.0, 3, keep=tmp_path)
     assert [row.program for row in runner.bench(settings).rows] == ["a", "b"]
     # After runs that are not measured, which compile.
     assert order[2:] == ["a", "b", "b", "a", "a", "b"]

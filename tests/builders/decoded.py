@@ -11,12 +11,13 @@ import numpy as np
 from mlbatch.arrays import F32Array, F64Array, I64Array, U8Array, U16Array
 from mlbatch.decode.decoder import Decoder, ScanHeader, WindowColumns
 from mlbatch.decode.groups import slot_numbers
-from mlbatch.decode.packet_ring import PacketRing
 from mlbatch.decode.source import Source
 from mlbatch.lidar.geometry import BeamTable
 from mlbatch.lidar.interface import Lidar, Records
 from mlbatch.lidar.pixel_table import BitField, ChannelRun, PixelTable, ReturnLayout
 from mlbatch.lidar.projections import Projection
+from mlbatch.native.arena import PacketArena
+from mlbatch.pipeline.sensor import new_ring
 from mlbatch.sensors.base import BaseLidar
 from mlbatch.types import EXTRAS, ColumnHeaders, RunInfo, SensorInfo
 
@@ -55,9 +56,9 @@ def readings(
     """Decode packets (P, size); encoder: (n,) of the columns, instead of what the packets say."""
     received_ns = np.zeros(len(packets), np.int64) if host_ns is None else host_ns
     headers = lidar.column_headers(packets, received_ns)
-    ring = PacketRing(lidar.packet_size, lidar.records)
+    ring = new_ring(lidar, PacketArena())
     start = np.arange(len(packets), dtype=np.int64) * lidar.packet_size
-    _, first = ring.store(packets.reshape(-1).copy(), start, None)
+    _, first = ring.store(packets.reshape(-1).copy(), start)
     place = first[:, None] + ring.column_offsets(lidar.columns_per_packet)
     pose = np.eye(4) if body_from_sensor is None else body_from_sensor
     source = Source(lidar, ring, pose, 0, keep_repeated=True)

@@ -9,10 +9,10 @@ import numpy as np
 from mlbatch.batching.batcher import Batcher
 from mlbatch.batching.grid import Grid
 from mlbatch.batching.intake import Accepted, Arrival, Intake
-from mlbatch.batching.reference import FeedPacket, Outcome, Settings, Window
 from mlbatch.batching.windows import Limit, Policy
 from mlbatch.batching.windows import Window as FastWindow
 from mlbatch.types import ColumnHeaders
+from tests.reference.batching import FeedPacket, Outcome, Settings, Window
 
 
 class _Watched(Intake):

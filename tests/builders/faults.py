@@ -6,7 +6,7 @@ import random
 from collections.abc import Sequence
 from dataclasses import replace
 
-from mlbatch.batching.reference import FeedPacket
+from tests.reference.batching import FeedPacket
 
 NS_PER_S = 10**9
 NS_PER_MS = 10**6

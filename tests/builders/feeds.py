@@ -15,9 +15,9 @@ from typing import TypeAlias
 
 from hypothesis import strategies as st
 
-from mlbatch.batching.reference import FeedPacket, Intake, Settings
 from mlbatch.errors import ClockError
 from tests.builders.faults import spoiled
+from tests.reference.batching import FeedPacket, Intake, Settings
 
 NS_PER_S = 10**9
 NS_PER_MS = 10**6

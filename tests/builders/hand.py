@@ -6,7 +6,7 @@ from collections.abc import Iterable
 from dataclasses import replace
 from fractions import Fraction
 
-from mlbatch.batching.reference import FeedPacket, Outcome, Settings, Window
+from tests.reference.batching import FeedPacket, Outcome, Settings, Window
 
 MS = 10**6
 TEN_HZ = Settings(rate=Fraction(10), sensors=1)

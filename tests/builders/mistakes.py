@@ -250,11 +250,6 @@ MISTAKES: dict[str, tuple[str, int, str]] = {
         "--point-layout: expected one of standard, velodyne, ouster, hesai, autoware, kiss-icp, "
         "minimal, found 'loam'; choose one",
     ),
-    "engine": (
-        f"{FIX} --engine cuda",
-        2,
-        "--engine: expected auto or numpy or native, found 'cuda'; choose one of them",
-    ),
     "jobs": (
         f"{FIX} --jobs 0",
         2,

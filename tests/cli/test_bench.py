@@ -13,7 +13,7 @@ from mlbatch.bench.cases import Case, Conversion
 from mlbatch.cli import bench as options
 from tests.builders.run import command
 
-SHORT = ("bench", "--seconds", "1", "--repeat", "1", "--case", "three-vlp16", "--engine", "numpy")
+SHORT = ("bench", "--seconds", "1", "--repeat", "1", "--case", "three-vlp16")
 
 
 def test_a_short_run_and_another_against_it(tmp_path: Path) -> None:
@@ -21,8 +21,8 @@ def test_a_short_run_and_another_against_it(tmp_path: Path) -> None:
     assert (done.code, done.err) == (0, "")
     found = json.loads(done.out)
     rows = {row["program"]: row for row in found["rows"]}
-    assert list(rows) == ["numpy", "python with numpy", "memory copy"]
-    ours = rows["numpy"]
+    assert list(rows) == ["mlbatch", "python with numpy", "memory copy"]
+    ours = rows["mlbatch"]
     copied = rows["memory copy"]
     assert ours["scans"] > 5
     # 32 slots in a block of 110.592 us, of three sensors, in whole windows.
@@ -78,11 +78,6 @@ def test_a_failed_conversion_is_reported_at_the_end(
         (("--seconds", "0.5"), 2, "--seconds: expected 1 to 3600, found 0.5"),
         (("--seconds", "nan"), 2, "--seconds: expected 1 to 3600, found nan"),
         (("--repeat", "0"), 2, "--repeat: expected 1 to 1000, found 0"),
-        (
-            ("--engine", "abacus"),
-            2,
-            "--engine: expected one of all, numpy, native, auto, found 'abacus'",
-        ),
         (("--case", "none"), 2, "--case: expected one of dual-4, "),
         (("--against", "/no/file"), 1, "/no/file: expected an earlier result"),
         (("--peer-python", "/no/python"), 1, "--peer-python: expected a program, found /no/python"),
@@ -106,15 +101,8 @@ def test_a_full_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert not list(tmp_path.iterdir())
 
 
-def test_without_the_library_only_numpy_is_measured(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("mlbatch.native.library_path", lambda: None)
-    engines, notes = options.engines_to_measure("all")
-    assert engines == ("numpy",)
-    assert notes == ("engine native was not measured: its library is not installed",)
-
-
 def test_a_case_that_is_named_twice_is_measured_once() -> None:
     """Otherwise its rows would be compared with each other."""
     names = ["pandar64", "mixed", "pandar64"]
-    settings = options.settings_from(1.0, 1, names, "numpy", [], None, None)
+    settings = options.settings_from(1.0, 1, names, [], None, None)
     assert [case.name for case in settings.cases] == ["pandar64", "mixed"]

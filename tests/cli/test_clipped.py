@@ -28,7 +28,6 @@ from tests.builders.sessions import (
 )
 from tests.builders.sessions_of_bags import write_mcap
 
-ENGINES = ("numpy", "native")
 SPEC = OusterSpec(profile="RNG19_RFL8_SIG16_NIR16", beams=16, columns_per_frame=512, serial=111)
 COLUMN_NS = 100 * NS_PER_MS // 512
 
@@ -78,15 +77,11 @@ def _intensities(path: Path) -> list[int]:
     return values
 
 
-@pytest.mark.parametrize("engine", ENGINES)
 @pytest.mark.parametrize("jobs", [1, 3])
-def test_reflectivity_is_the_intensity_of_8_bits(
-    shell: Shell, tmp_path: Path, engine: str, jobs: int
-) -> None:
+def test_reflectivity_is_the_intensity_of_8_bits(shell: Shell, tmp_path: Path, jobs: int) -> None:
     _ouster(tmp_path)
     outcome = shell(
-        f"convert drive.pcap -o out.mcap --point-layout autoware --engine {engine} --jobs {jobs} "
-        "--strict"
+        f"convert drive.pcap -o out.mcap --point-layout autoware --jobs {jobs} --strict"
     )
     assert (outcome.code, outcome.warnings) == (0, []), outcome.err
     values = _intensities(tmp_path / "out.mcap")
@@ -98,15 +93,12 @@ def test_reflectivity_is_the_intensity_of_8_bits(
     assert shell("verify out.mcap").code == 0
 
 
-@pytest.mark.parametrize("engine", ENGINES)
 @pytest.mark.parametrize("split", ["", " --split"])
 @pytest.mark.parametrize("layout", ["dense", "organized"])
-def test_clipped_points_are_counted(
-    shell: Shell, tmp_path: Path, engine: str, split: str, layout: str
-) -> None:
+def test_clipped_points_are_counted(shell: Shell, tmp_path: Path, split: str, layout: str) -> None:
     """Of 10 points a sweep two are above 255 and one is below 0; 255 itself is none of them."""
     _clouds(tmp_path, [0, 1, 255, 256, -1, 17, 18, 19, 4000, 20])
-    common = f"convert drive.mcap --keep-partial --engine {engine} --layout {layout}{split}"
+    common = f"convert drive.mcap --keep-partial --layout {layout}{split}"
     outcome = shell(f"{common} -o out.mcap --point-layout autoware")
     assert outcome.code == 0, outcome.err
     (sensor,) = report_of("out.mcap.report.json")["sensors"]

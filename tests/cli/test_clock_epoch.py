@@ -25,7 +25,6 @@ from tests.builders.sessions import (
 from tests.builders.sessions_of_bags import unit_messages, write_mcap
 
 TAI_S = 37
-ENGINES = ("numpy", "native")
 PTP_SPEC: OusterSpec = replace(SMALL, timestamp_mode="TIME_FROM_PTP_1588")
 ZERO = "extrinsics: {translation_m: [0, 0, 0]}"
 needs_recordings = pytest.mark.skipif(not RECORDINGS.is_dir(), reason=NO_RECORDINGS)
@@ -38,11 +37,10 @@ def _ahead(seconds: float, unit: Unit | None = None) -> Unit:
     return replace(unit, begin_ns=unit.begin_ns + ahead_ns, host_ns=unit.host_ns - ahead_ns)
 
 
-@pytest.mark.parametrize("engine", ENGINES)
 @pytest.mark.parametrize("jobs", ["1", "3"])
-def test_a_single_lidar_on_tai(shell: Shell, tmp_path: Path, engine: str, jobs: str) -> None:
+def test_a_single_lidar_on_tai(shell: Shell, tmp_path: Path, jobs: str) -> None:
     write_session(tmp_path, _ahead(TAI_S))
-    outcome = shell(f"convert drive.pcap -o out --engine {engine} --jobs {jobs}")
+    outcome = shell(f"convert drive.pcap -o out --jobs {jobs}")
     assert (outcome.code, outcome.warnings) == (0, ["clock_epoch"])
     (warning,) = report_of("out/report.json")["warnings"]
     assert (warning["code"], warning["sensor"]) == ("clock_epoch", "ouster_111")

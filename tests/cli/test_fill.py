@@ -66,10 +66,9 @@ def _rows(path: str) -> list[dict[str, str]]:
         return list(csv.DictReader(file))
 
 
-@pytest.mark.parametrize("engine", ["numpy", "native"])
 @pytest.mark.parametrize("jobs", [1, 3])
-def test_half_a_second_of_one_lidar(shell: Shell, capture: Path, engine: str, jobs: int) -> None:
-    words = f"convert {capture} --identity-extrinsics --engine {engine} --jobs {jobs} -o out"
+def test_half_a_second_of_one_lidar(shell: Shell, capture: Path, jobs: int) -> None:
+    words = f"convert {capture} --identity-extrinsics --jobs {jobs} -o out"
     outcome = shell(words)
     assert (outcome.code, outcome.warnings) == (0, ["identity_extrinsics", "loss"])
     scans = report_of("out/report.json")["scans"]

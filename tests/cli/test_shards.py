@@ -44,11 +44,10 @@ def shell(
 
 
 def _shards(shell: Shell, words: str, count: int, mixed: bool = False) -> list[str]:
-    """Convert all shards; gives their folders. mixed: by both engines, with one job or several."""
+    """Convert all shards; gives their folders. mixed: by one job or several."""
     folders = []
     for number in range(1, count + 1):
-        engine = ("numpy", "native")[number % 2]
-        more = f" --engine {engine} --jobs {number}" if mixed else ""
+        more = f" --jobs {number}" if mixed else ""
         done = shell(f"convert {words} --shard {number}/{count} -o part{number} -q{more}")
         assert done.code == 0, done.err
         folders.append(f"part{number}")
@@ -124,7 +123,7 @@ def test_options_give_the_bytes_of_one_run(shell: Shell, options: str) -> None:
     _assert_as_one_run(shell, f"{CAPTURE} {options}", 3)
 
 
-def test_engines_and_jobs_may_differ_between_shards(shell: Shell) -> None:
+def test_jobs_may_differ_between_shards(shell: Shell) -> None:
     _assert_as_one_run(shell, f"{CAPTURE} --slices 2", 4, mixed=True)
 
 

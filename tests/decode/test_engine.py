@@ -28,8 +28,10 @@ from mlbatch.decode.source import Source
 from mlbatch.frames.transforms import from_rpy_deg
 from mlbatch.lidar.geometry import BeamTable, rotor_words
 from mlbatch.lidar.interface import Lidar
+from mlbatch.native.arena import PacketArena
 from mlbatch.native.library import library
 from mlbatch.pipeline.conversion import Conversion
+from mlbatch.pipeline.sensor import new_ring
 from mlbatch.sensors.ouster.profiles import PROFILES
 from mlbatch.sensors.ouster.sensor import read_calibration
 from mlbatch.types import EXTRAS, RecordLayout, RunInfo, SensorInfo
@@ -165,15 +167,15 @@ def packets_of(lidar: Lidar, rng: np.random.Generator, count: int) -> npt.NDArra
 
 def filled(lidar: Lidar, rng: np.random.Generator) -> tuple[PacketRing, I64Array]:
     """A ring that has wrapped, and the ring indexes of the columns that it contains."""
-    ring = PacketRing(lidar.packet_size, lidar.records)
+    arena = PacketArena()
+    ring = new_ring(lidar, arena)
     places: I64Array = np.empty(0, np.int64)
     for _ in range(4):
         count = int(rng.integers(20, 45))
         start = np.arange(count) * lidar.packet_size
-        oldest = int(places[0]) if len(places) else None
-        _, found = ring.store(packets_of(lidar, rng, count), start, oldest)
-        places = found
-    return ring, (places[:, None] + np.arange(lidar.columns_per_packet)).reshape(-1)
+        arena.keep_from(int(places[0]) if len(places) else None)
+        _, places = ring.store(packets_of(lidar, rng, count), start)
+    return ring, (places[:, None] + ring.column_offsets(lidar.columns_per_packet)).reshape(-1)
 
 
 def words_of(lidar: Lidar, rng: np.random.Generator, count: int) -> I64Array:
@@ -429,7 +431,7 @@ def test_records_stay_while_the_loops_run() -> None:
 
         def mlbatch_decode(self, scan: object) -> int:
             start = np.arange(1000) * lidar.packet_size
-            ring.store(packets_of(lidar, rng, 1000), start, int(places[0]))
+            ring.store(packets_of(lidar, rng, 1000), start)
             grown.append(before() is not None and before() is not ring.view[0])
             return int(decode_columns(scan))
 

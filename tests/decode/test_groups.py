@@ -10,8 +10,9 @@ import pytest
 
 from mlbatch.arrays import I64Array
 from mlbatch.decode.decoder import Decoder, ScanHeader, Source, WindowColumns
-from mlbatch.decode.packet_ring import PacketRing
 from mlbatch.frames.transforms import from_rpy_deg
+from mlbatch.native.arena import PacketArena
+from mlbatch.pipeline.sensor import new_ring
 from mlbatch.types import RunInfo, Scan, SensorInfo
 from tests.builders.velodyne import VelodyneSpec
 from tests.builders.velodyne_streams import Seen, made_of
@@ -33,10 +34,10 @@ class Sensor:
 def _sensor(number: int, seen: Seen) -> Sensor:
     lidar = seen.lidar
     sent = seen.sent
-    ring = PacketRing(lidar.packet_size, lidar.records)
+    ring = new_ring(lidar, PacketArena())
     start = np.arange(len(sent.payloads), dtype=np.int64) * lidar.packet_size
-    _, first = ring.store(sent.payloads.reshape(-1).copy(), start, None)
-    place = (first[:, None] + np.arange(lidar.columns_per_packet)).reshape(-1)
+    _, first = ring.store(sent.payloads.reshape(-1).copy(), start)
+    place = (first[:, None] + ring.column_offsets(lidar.columns_per_packet)).reshape(-1)
     headers = lidar.column_headers(sent.payloads, sent.host_ns)
     source = Source(lidar, ring, _POSES[number], number * lidar.channels, 1.0 + number, 90.0)
     return Sensor(source, headers.stamp_ns.reshape(-1), place, headers.encoder.reshape(-1))

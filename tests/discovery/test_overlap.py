@@ -63,10 +63,8 @@ def test_different_lidars_at_different_times_are_refused(
 ) -> None:
     left = pack(_capture(tmp_path / "left.pcap", ONE.records, [ONE]))
     right = pack(_capture(tmp_path / "right.pcap", LATER.records, [LATER]))
-    for jobs, words in ((1, ["--engine", "numpy"]), (3, ["--engine", "native"])):
-        done = shell(
-            "convert", *[left, right][::order], "-o", "out", IDENTITY, "--jobs", str(jobs), *words
-        )
+    for jobs in ("1", "3"):
+        done = shell("convert", *[left, right][::order], "-o", "out", IDENTITY, "--jobs", jobs)
         assert (done.code, done.out) == (1, "")
         assert done.err == (
             f"mlbatch: error: {left} ({FIRST}), {right} ({SECOND}): expected recordings of "

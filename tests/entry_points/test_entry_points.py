@@ -135,12 +135,9 @@ def test_the_example_installed(tmp_path: Path) -> None:
     _check_conversion(site, tmp_path)
 
 
-@pytest.mark.parametrize("engine", ["numpy", "auto"])
-def test_the_scans_of_the_example_are_those_of_any_engine(
-    engine: str, site: Path, tmp_path: Path
-) -> None:
+def test_the_example_is_converted(site: Path, tmp_path: Path) -> None:
     write_framelog(tmp_path / "drive.flog")
-    arguments = ["convert", "drive.flog", "-o", "scans.mcap", "--engine", engine]
+    arguments = ["convert", "drive.flog", "-o", "scans.mcap"]
     assert _run(site, tmp_path, *arguments).returncode == 0
     assert "violated" not in _run(site, tmp_path, "verify", "scans.mcap").stdout
 

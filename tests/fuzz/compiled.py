@@ -15,14 +15,16 @@ from pathlib import Path
 import numpy as np
 
 from mlbatch.arrays import I64Array, U8Array
-from mlbatch.batching.merge import ColumnMerge, column_merge
+from mlbatch.batching.merge import ColumnMerge
 from mlbatch.decode.decoder import ScanHeader
 from mlbatch.decode.packet_ring import PacketRing
 from mlbatch.decode.source import Source
 from mlbatch.lidar.content_keys import content_keys, hash_factors
 from mlbatch.lidar.geometry import rotor_words
 from mlbatch.lidar.interface import Lidar
+from mlbatch.native.arena import PacketArena
 from mlbatch.native.library import trouble
+from mlbatch.pipeline.sensor import new_ring
 from mlbatch.readers.capture.dissector import Dissector
 from mlbatch.readers.capture.frames import Frames
 from mlbatch.ros.point_packets import CloudError, Layout, Points, layout_of, pack
@@ -101,7 +103,7 @@ def _pair(
     """Both decoders for one lidar, of arrays or of packed records."""
     lidar = _lidars()[number]
     pose = POSES[number % len(POSES)]
-    ring = PacketRing(lidar.packet_size, lidar.records)
+    ring = new_ring(lidar, PacketArena())
     low_m, high_m = (1.0, 60.0) if is_cut else (0.0, float("inf"))
     sources = [Source(lidar, ring, pose, 0, low_m, high_m, keeps_repeated)]
     info = SensorInfo("one", lidar.model, lidar.channels, lidar.returns, 0, pose)
@@ -130,8 +132,8 @@ def _decode(data: bytes, folder: Path) -> None:
     )
     size = lidar.packet_size * _PACKETS
     packets = np.frombuffer(data[_HEAD.size :].ljust(size, b"\0")[:size], np.uint8)
-    _, places = ring.store(packets, np.arange(_PACKETS) * lidar.packet_size, None)
-    every = (places[:, None] + np.arange(lidar.columns_per_packet)).reshape(-1)
+    _, places = ring.store(packets, np.arange(_PACKETS) * lidar.packet_size)
+    every = (places[:, None] + ring.column_offsets(lidar.columns_per_packet)).reshape(-1)
     place = rng.choice(every, _COLUMNS)
     word = words_of(lidar, rng, _COLUMNS)
     stamp_ns = np.sort(rng.integers(START_NS, END_NS, _COLUMNS))
@@ -335,23 +337,9 @@ def _merge(data: bytes, folder: Path) -> None:
     words = rotor_words(np.float64(1 / 512) * ticks, np.float64(1) * (ticks % 41) - 20.0)
     word = np.choose(sensor, (ticks % 512, words, ticks % 8))
     stamp_ns = START_NS + step.cumsum()
-    until = [int(stamp_ns[len(rows) * third // 3]) if rows else 0 for third in (1, 2)]
-    portions = (*until, END_NS)
-    taken = [
-        _taken(column_merge(name, _POSITIONS), sensor, stamp_ns, word, portions)
-        for name in ("numpy", "native")
-    ]
-    if taken[0] != taken[1]:
-        raise BrokenLaw("compiled loops merge otherwise than numpy")
-
-
-def _taken(
-    merge: ColumnMerge,
-    sensor: I64Array,
-    stamp_ns: I64Array,
-    word: I64Array,
-    portions: Sequence[int],
-) -> object:
+    portions = [int(stamp_ns[len(rows) * third // 3]) if rows else 0 for third in (1, 2)]
+    places = [int(np.count_nonzero(sensor[:at] == sensor[at])) for at in range(len(sensor))]
+    left = list(zip(stamp_ns.tolist(), sensor.tolist(), places, word.tolist(), strict=True))
     waiting: list[list[Columns]] = [[] for _ in range(_SENSORS)]
     for number, own in enumerate(waiting):
         is_own = sensor == number
@@ -360,14 +348,18 @@ def _taken(
         for part in (slice(None, half), slice(half, None)):
             if len(stamps[part]):
                 own.append(Columns(stamps[part], np.arange(len(stamps))[part], words[part]))
-    found = []
-    for until in portions:
+    merge = ColumnMerge(_POSITIONS)
+    for until in (*portions, END_NS):
         merged = merge.take_until(waiting, until)
-        third = len(merged.stamp_ns) // 3
-        figures = merge.figures(merged, [third, len(merged.stamp_ns)])
         arrays = (merged.stamp_ns, merged.sensor, merged.ring_index, merged.encoder)
-        found.append(([one.tolist() for one in arrays], figures))
-    return found
+        due = sorted(one for one in left if one[0] < until)
+        left = [one for one in left if one[0] >= until]
+        if list(zip(*(one.tolist() for one in arrays), strict=True)) != due:
+            raise BrokenLaw("columns are merged in another order than by stamp, sensor, delivery")
+        ends = [len(due) // 3, len(due)]
+        found = merge.figures(merged, ends)
+        if sum(one.columns for window in found for one in window) != len(due):
+            raise BrokenLaw("the figures of windows have other columns than the windows")
 
 
 TARGETS: Sequence[Target] = (

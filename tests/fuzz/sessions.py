@@ -17,7 +17,6 @@ from pathlib import Path
 
 from mlbatch.discovery.discover import SensorSelection
 from mlbatch.errors import MlbatchError
-from mlbatch.native.library import trouble
 from mlbatch.pipeline.job import Job
 from mlbatch.verify import verify
 from tests.builders.captures import udp_frame, write_pcap
@@ -64,7 +63,7 @@ def _job(data: bytes, folder: Path) -> Job:
 
 
 def _convert(data: bytes, folder: Path) -> None:
-    result = in_memory(replace(_job(data, folder), engine="numpy"))
+    result = in_memory(_job(data, folder))
     check_ledgers(result.report)
     check_output(result)
 
@@ -125,7 +124,7 @@ def _verified(data: bytes, folder: Path) -> None:
     words: list[str | Path] = ["convert", *job.recordings, "-o", output, "--keep-partial"]
     for path in job.selection.metadata:
         words += ["--metadata", path]
-    run = command(*words, "--no-fsync", "--quiet", "--engine", "numpy")
+    run = command(*words, "--no-fsync", "--quiet")
     if run.code:
         raise MlbatchError(run.err.splitlines()[-1])
     verdict = verify(output)
@@ -147,17 +146,12 @@ def _outcome(job: Job) -> object:
 
 def _compare(job: Job, other: Job) -> None:
     if _outcome(job) != _outcome(other):
-        raise BrokenLaw(f"{other.jobs} jobs, {other.engine}: other scans than in one by numpy")
+        raise BrokenLaw(f"{other.jobs} jobs: other scans than in one")
 
 
 def _share(data: bytes, folder: Path) -> None:
-    job = replace(_job(data, folder), engine="numpy")
+    job = _job(data, folder)
     _compare(job, replace(job, jobs=2))
-
-
-def _compile(data: bytes, folder: Path) -> None:
-    job = replace(_job(data, folder), engine="numpy")
-    _compare(job, replace(job, engine="native"))
 
 
 # A pcap counts seconds in 32 bits.
@@ -167,5 +161,4 @@ TARGETS: Sequence[Target] = (
     Target("sessions", _seeds, _convert, mutated_parts, 2),
     Target("sessions, verified", _described_seeds, _verified, _mutated_geometry, 2),
     Target("sessions of two jobs", _seeds, _share, mutated_parts, 2),
-    *((Target("sessions, compiled", _seeds, _compile, mutated_parts, 2),) if not trouble() else ()),
 )

@@ -1,6 +1,6 @@
 """Digests of what a command wrote: SHA-256 per file, without machine, time and wording.
 
-Two groups. `product`: files that only the packets and the options decide; equal for both engines,
+Two groups. `product`: files that only the packets and the options decide; equal for
 any number of jobs and every container. `context`: what names or counts the input: the report, the
 receive time at which a scan was ready. Texts of several words are kept apart, in neither.
 """

@@ -44,7 +44,7 @@ RECORDINGS: Mapping[str, Sequence[str]] = {
     "bag_db3": ("db3",),
     "bag_ros1": ("bag",),
 }
-# Those that meet every format, layout, container and engine.
+# Those that meet every format, layout and container.
 PAIRED = tuple(name for name in RECORDINGS if not name.startswith("bag_"))
 _WITH_RIG = PAIRED[: PAIRED.index("livox")]
 

@@ -2,8 +2,8 @@
 
 `digests.json` holds SHA-256 of every output file of small recordings, `wording.json` the texts in
 them, which digests leave out. Only the command line runs here, and only files are read, so that
-the test outlives every reorganisation of the package. One digest serves both engines, any number
-of jobs and all containers. To write the files again, after a change that is meant:
+the test outlives every reorganisation of the package. One digest serves any number of jobs and
+all containers. To write the files again, after a change that is meant:
 
     python -m tests.golden.test_digests --write
     python -m tests.golden.test_digests --write-wording
@@ -31,7 +31,6 @@ from unittest.mock import patch
 import pytest
 
 from mlbatch.cli import app, main
-from mlbatch.native.library import trouble
 from tests.builders.parser import parser
 from tests.golden.digest_outputs import Digests
 from tests.golden.digest_recordings import (
@@ -46,7 +45,6 @@ _HERE = Path(__file__).resolve().parent
 _REPOSITORY = _HERE.parents[1]
 _DIGESTS = _HERE / "digests.json"
 _WORDING = _HERE / "wording.json"
-_NO_NATIVE = "the engine native is not installed: no C compiler was found"
 _SUFFIX = {"mcap": ".mcap", "rosbag1": ".bag"}
 
 
@@ -60,13 +58,7 @@ class Run:
 
     container: str = ""
     jobs: int = 1
-    engine: str = "numpy"
     interrupt: str = ""
-
-    @property
-    def can_run(self) -> bool:
-        """Whether its engine is here."""
-        return self.engine != "native" or not trouble()
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,48 +77,48 @@ class Case:
 
 
 # A cover of all pairs of values, as far as they go together (`test_rows_cover_all_pairs`).
-# recording, format, layout, compression, container, jobs, engine
+# recording, format, layout, compression, container, jobs
 ROWS = """
-two_lidars mcap organized zstd bag 3 numpy
-two_lidars npz dense none pcapng 3 native
-two_lidars ply dense none mcap 1 native
-two_lidars rosbag1 dense none pcap 1 native
-two_lidars rosbag2 organized zstd db3 1 native
-four_makers mcap dense zstd mcap 1 numpy
-four_makers npz dense none pcap 3 numpy
-four_makers ply dense none db3 3 numpy
-four_makers rosbag1 organized none bag 1 numpy
-four_makers rosbag2 organized none pcapng 3 native
-ouster mcap dense zstd pcapng 1 native
-ouster npz dense none bag 1 native
-ouster ply dense none pcap 3 native
-ouster rosbag1 organized none db3 3 numpy
-ouster rosbag2 organized zstd mcap 3 numpy
-velodyne mcap organized zstd db3 1 native
-velodyne npz organized none mcap 1 native
-velodyne ply dense none bag 3 numpy
-velodyne rosbag1 dense none pcapng 3 numpy
-velodyne rosbag2 dense none pcap 3 numpy
-hesai mcap organized none pcap 3 native
-hesai npz organized none bag 3 numpy
-hesai ply dense none pcapng 3 native
-hesai rosbag1 organized none mcap 3 native
-hesai rosbag2 dense zstd db3 1 numpy
-robosense mcap organized zstd pcap 3 numpy
-robosense npz dense none db3 3 numpy
-robosense ply dense none bag 1 native
-robosense rosbag1 dense none pcapng 1 numpy
-robosense rosbag2 organized zstd mcap 1 native
-livox mcap organized zstd pcapng 1 numpy
-livox npz dense none pcapng 3 numpy
-livox ply dense none pcapng 1 numpy
-livox rosbag1 organized none pcap 3 numpy
-livox rosbag2 organized zstd pcap 1 native
-clouds mcap dense none db3 3 native
-clouds npz organized none mcap 1 native
-clouds ply dense none bag 1 native
-clouds rosbag1 organized none db3 1 native
-clouds rosbag2 dense zstd bag 3 numpy
+two_lidars mcap organized zstd bag 3
+two_lidars npz dense none pcapng 3
+two_lidars ply dense none mcap 1
+two_lidars rosbag1 dense none pcap 1
+two_lidars rosbag2 organized zstd db3 1
+four_makers mcap dense zstd mcap 1
+four_makers npz dense none pcap 3
+four_makers ply dense none db3 3
+four_makers rosbag1 organized none bag 1
+four_makers rosbag2 organized none pcapng 3
+ouster mcap dense zstd pcapng 1
+ouster npz dense none bag 1
+ouster ply dense none pcap 3
+ouster rosbag1 organized none db3 3
+ouster rosbag2 organized zstd mcap 3
+velodyne mcap organized zstd db3 1
+velodyne npz organized none mcap 1
+velodyne ply dense none bag 3
+velodyne rosbag1 dense none pcapng 3
+velodyne rosbag2 dense none pcap 3
+hesai mcap organized none pcap 3
+hesai npz organized none bag 3
+hesai ply dense none pcapng 3
+hesai rosbag1 organized none mcap 3
+hesai rosbag2 dense zstd db3 1
+robosense mcap organized zstd pcap 3
+robosense npz dense none db3 3
+robosense ply dense none bag 1
+robosense rosbag1 dense none pcapng 1
+robosense rosbag2 organized zstd mcap 1
+livox mcap organized zstd pcapng 1
+livox npz dense none pcapng 3
+livox ply dense none pcapng 1
+livox rosbag1 organized none pcap 3
+livox rosbag2 organized zstd pcap 1
+clouds mcap dense none db3 3
+clouds npz organized none mcap 1
+clouds ply dense none bag 1
+clouds rosbag1 organized none db3 1
+clouds rosbag2 dense zstd bag 3
 """
 _FACTORS: tuple[Sequence[str], ...] = (
     PAIRED,
@@ -135,28 +127,22 @@ _FACTORS: tuple[Sequence[str], ...] = (
     ("none", "zstd"),
     CONTAINERS,
     ("1", "3"),
-    ("numpy", "native"),
 )
-_NATIVE = Run(engine="native")
 _PASSED = ("--pass", "/*/ouster/metadata")
-_THREE_NATIVE = Run(jobs=3, engine="native")
+_THREE = Run(jobs=3)
 
 
 def _row_cases() -> dict[str, Case]:
     cases = {}
     for row in ROWS.split("\n")[1:-1]:
-        recording, format_, layout, compression, container, jobs, engine = row.split()
+        recording, format_, layout, compression, container, jobs = row.split()
         options = ("--layout", layout, "--compression", compression)
-        own = Run(container, int(jobs), engine)
-        runs = (own,) if engine == "native" else (own, _NATIVE)
         name = f"{recording} {format_} {layout} {compression}"
-        cases[name] = Case(recording, options, format_, runs)
+        cases[name] = Case(recording, options, format_, (Run(container, int(jobs)),))
     return cases
 
 
-def _case(
-    recording: str, *options: str, format: str = "npz", runs: tuple[Run, ...] = (_NATIVE,)
-) -> Case:
+def _case(recording: str, *options: str, format: str = "npz", runs: tuple[Run, ...] = ()) -> Case:
     return Case(recording, options, format, runs)
 
 
@@ -164,17 +150,17 @@ def _option_cases() -> dict[str, Case]:
     two = "two_lidars"
     four = "four_makers"
     cases = {
-        "split": _case(two, "--split", runs=(_THREE_NATIVE, Run("db3"))),
-        "split mcap": _case(four, "--split", format="mcap", runs=(_THREE_NATIVE, Run("mcap"))),
-        "slices": _case(two, "--slices", "4", format="mcap", runs=(_THREE_NATIVE, Run("bag"))),
-        "slices npz": _case(four, "--slices", "4", runs=(_THREE_NATIVE,)),
+        "split": _case(two, "--split", runs=(_THREE, Run("db3"))),
+        "split mcap": _case(four, "--split", format="mcap", runs=(_THREE, Run("mcap"))),
+        "slices": _case(two, "--slices", "4", format="mcap", runs=(_THREE, Run("bag"))),
+        "slices npz": _case(four, "--slices", "4", runs=(_THREE,)),
         "split slices rosbag2": _case(two, "--split", "--slices", "4", format="rosbag2"),
-        "keep partial": _case(two, "--keep-partial", runs=(_THREE_NATIVE, Run("mcap"))),
+        "keep partial": _case(two, "--keep-partial", runs=(_THREE, Run("mcap"))),
         "keep partial ply": _case(four, "--keep-partial", format="ply"),
         "drop incomplete": _case(
             two, "--keep-partial", "--drop-incomplete", "90", "--fault", "stall:left:0.3s-0.5s"
         ),
-        "align clocks": _case(two, "--align-clocks", runs=(_NATIVE, Run("pcapng"))),
+        "align clocks": _case(two, "--align-clocks", runs=(Run("pcapng"),)),
         "align clocks to first": _case(
             two, "--align-clocks", "--align-to", "first", "--fault", "drift:right:80ppm"
         ),
@@ -212,7 +198,7 @@ def _option_cases() -> dict[str, Case]:
             ),
             *("--fault", "reorder:right:3%", "--fault", "truncate:right:1%", "--fault-seed", "5"),
             *("--keep-partial", "--fault", "delay:roof:60ms"),
-            runs=(_THREE_NATIVE,),
+            runs=(_THREE,),
         ),
         "early": _case(four, "--fault", "early:left:0.1s", "--keep-partial"),
         "stall": _case(two, "--fault", "stall:right:0.2s-0.7s", "--max-wait", "0.1"),
@@ -225,7 +211,7 @@ def _option_cases() -> dict[str, Case]:
         ),
         "resumed rosbag1": _case(two, format="rosbag1", runs=(Run(interrupt="size:2000000"),)),
         # Messages that pass through keep the QoS and the definitions of their recording.
-        "bag mcap": _case("bag_mcap", *_PASSED, format="mcap", runs=(_THREE_NATIVE,)),
+        "bag mcap": _case("bag_mcap", *_PASSED, format="mcap", runs=(_THREE,)),
         "bag rosbag1": _case("bag_mcap", *_PASSED, format="rosbag1"),
         "bag rosbag2": _case("bag_mcap", *_PASSED, format="rosbag2", runs=(Run(jobs=3),)),
         "db3 bag rosbag2": _case("bag_db3", *_PASSED, format="rosbag2"),
@@ -235,7 +221,7 @@ def _option_cases() -> dict[str, Case]:
     }
     for preset in ("velodyne", "ouster", "hesai", "autoware", "kiss-icp", "minimal"):
         options = ("--point-layout", preset)
-        cases[f"points {preset}"] = _case(four, *options, format="mcap", runs=(_NATIVE,))
+        cases[f"points {preset}"] = _case(four, *options, format="mcap")
         cases[f"points {preset} organized"] = _case(
             four, *options, "--layout", "organized", format="rosbag1", runs=()
         )
@@ -326,7 +312,7 @@ def words_of(case: Case, run: Run) -> list[str]:
     # What has no rig has one lidar, or its poses in the recording.
     words += ["--rig", f"in/{case.recording}/{rig}"] if rig else ["--rate", "20"]
     words += ["--format", case.format, "-o", f"made/{case.output}", "-q"]
-    return [*words, "--jobs", str(run.jobs), "--engine", run.engine]
+    return [*words, "--jobs", str(run.jobs)]
 
 
 # Runs the command line until it is killed. Its clock is fast, so that it keeps its state after
@@ -461,12 +447,9 @@ def test_outputs_are_what_they_were(
     case = CASES[name]
     with inside(workplace):
         for run in (Run(), *case.runs):
-            if run.can_run:
-                lines = run_differences(case, run, digests_of(case, run), kept[name])
-                shown = f"{name}: {words_of(case, run)}"
-                assert not lines, f"{shown} (was: {kept[name]['about']['baseline']})"
-    if not all(run.can_run for run in case.runs):
-        pytest.skip(f"the digests of numpy are equal; {_NO_NATIVE}")
+            lines = run_differences(case, run, digests_of(case, run), kept[name])
+            shown = f"{name}: {words_of(case, run)}"
+            assert not lines, f"{shown} (was: {kept[name]['about']['baseline']})"
 
 
 @pytest.mark.parametrize("name", QUERIES)
@@ -543,8 +526,6 @@ def _write() -> int:
         entry = entry_of(case, Run(), found)
         entry["about"] = {"baseline": found.about}
         for run in case.runs:
-            if not run.can_run:
-                raise SystemExit(_NO_NATIVE)
             other = digests_of(case, run)
             entry.setdefault(_context_key(case, run), other.context)
             for line in run_differences(case, run, other, entry):

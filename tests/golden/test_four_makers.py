@@ -1,7 +1,7 @@
 """A rig of four vendors, converted by one command: against the paper's loop, its scene and itself.
 
 Nothing expected comes from a decoder: stamps, ranges and firing times are those that the encoders
-put into the packets (`tests/builders/seen.py`); windows are those of `batching/reference.py`.
+put into the packets (`tests/builders/seen.py`); windows are those of `tests/reference/batching.py`.
 Times within a packet are whole ns for these models; what Velodyne and ROBOSENSE packets say of
 themselves is cut to whole us, and that is the time that counts.
 """
@@ -20,12 +20,12 @@ import numpy as np
 import pytest
 
 from mlbatch.arrays import BoolArray, F64Array, I64Array
-from mlbatch.batching.reference import FeedPacket, Outcome, Settings, Window, reference_scans
 from tests.builders.four_makers import FOLDER, HOUR_NS, PLACES, VELODYNE, arrivals, main, seen
 from tests.builders.run import Cloud, command, load, scan_files
 from tests.builders.scene import hall
 from tests.builders.seen import ASIDE_PER_M, Seen
 from tests.builders.seen_points import Expected, Points, pair_types, repeated
+from tests.reference.batching import FeedPacket, Outcome, Settings, Window, reference_scans
 
 PCAP = FOLDER / "four_makers.pcap"
 RIG = FOLDER / "rig.yaml"

@@ -150,10 +150,10 @@ def test_hard_motion_is_not_made_worse(shell: Shell, tmp_path: Path) -> None:
     assert motion["columns"] == motion["moved"] + motion["unmoved"]
 
 
-def test_it_does_not_depend_on_engine_jobs_and_layout(shell: Shell, drive: Recorded) -> None:
+def test_it_does_not_depend_on_jobs_and_layout(shell: Shell, drive: Recorded) -> None:
     line = f"{words(drive)} --deskew constant-velocity --end +2.5"
-    assert shell(f"{line} -o one.mcap --engine numpy").code == 0
-    assert shell(f"{line} -o two.mcap --engine native --jobs 3 --max-wait 0.3").code == 0
+    assert shell(f"{line} -o one.mcap").code == 0
+    assert shell(f"{line} -o two.mcap --jobs 3 --max-wait 0.3").code == 0
     assert Path("one.mcap").read_bytes() == Path("two.mcap").read_bytes()
     assert shell(f"{line} -o dense").code == 0
     assert shell(f"{line} -o grid --layout organized").code == 0
@@ -212,16 +212,16 @@ def test_slices_have_the_motion_of_their_window(shell: Shell, drive: Recorded) -
     """Points of slices, moved to its start, are those of the window at the start of the slice."""
     line = f"{words(drive)} --slices 4 --end +2.5"
     own = f"{line} --deskew constant-velocity"
-    assert shell(f"{own} -o numpy --engine numpy").code == 0
-    assert shell(f"{own} -o native --engine native --jobs 3").code == 0
+    assert shell(f"{own} -o one").code == 0
+    assert shell(f"{own} -o jobs --jobs 3").code == 0
     assert shell(f"{line} -o true --deskew {drive.truth}").code == 0
     assert shell(f"{line} -o none").code == 0
-    for name in names("numpy"):
-        assert Path("numpy", name).read_bytes() == Path("native", name).read_bytes()
-    left, without = distance_m("true", "numpy"), distance_m("true", "none")
+    for name in names("one"):
+        assert Path("one", name).read_bytes() == Path("jobs", name).read_bytes()
+    left, without = distance_m("true", "one"), distance_m("true", "none")
     moving = slice(4 * (AT_REST + 5), None)
     assert np.median(left[moving]) < 0.2 * np.median(without[moving])
-    assert shell("verify numpy").code == 0
+    assert shell("verify one").code == 0
 
 
 def test_in_a_corridor_nothing_is_moved_and_a_warning_says_so(shell: Shell, tmp_path: Path) -> None:

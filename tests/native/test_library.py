@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import ctypes
-import json
 import re
 import shutil
 import subprocess
@@ -15,7 +14,7 @@ import pytest
 import mlbatch
 from mlbatch import native
 from mlbatch.errors import UsageError
-from mlbatch.native import choose_engine, library
+from mlbatch.native import library, require_library
 from tests.builders.engines import needs_native
 from tests.builders.run import TWO_LIDARS, command
 from tests.contract.tree import PACKAGE
@@ -73,14 +72,13 @@ def test_the_version_of_the_declarations_is_that_of_the_header() -> None:
 
 
 @pytest.mark.usefixtures("_fresh")
-@pytest.mark.parametrize("engine", ["auto", "numpy", "native"])
 def test_without_the_library_nothing_is_decoded(
-    engine: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(library, "library_path", lambda: None)
     capture, rig = TWO_LIDARS / "two_lidars.pcap", TWO_LIDARS / "rig.yaml"
     out = tmp_path / "out.mcap"
-    done = command("convert", capture, "--rig", rig, "-o", out, "--engine", engine)
+    done = command("convert", capture, "--rig", rig, "-o", out)
     assert done.code == 2
     assert done.err == (
         "mlbatch: error: expected the compiled library of mlbatch, found none, since it was not "
@@ -96,7 +94,7 @@ def test_a_damaged_library_is_not_used(tmp_path: Path, monkeypatch: pytest.Monke
     monkeypatch.setenv("MLBATCH_NATIVE", str(path))
     assert native.library_path() == path
     with pytest.raises(UsageError, match=r"broken\.so"):
-        choose_engine("auto")
+        require_library()
 
 
 @needs_native
@@ -115,7 +113,7 @@ def test_a_library_of_another_version_is_not_used(
     subprocess.run(["cc", *flags, "-o", str(path), *files], check=True)
     monkeypatch.setenv("MLBATCH_NATIVE", str(path))
     with pytest.raises(UsageError, match=r"other\.so of another version"):
-        choose_engine("auto")
+        require_library()
 
 
 @pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler")
@@ -133,21 +131,19 @@ def test_the_sources_have_no_warnings(tmp_path: Path) -> None:
 
 
 @needs_native
-def test_the_name_of_an_earlier_engine_still_works(tmp_path: Path) -> None:
-    report = tmp_path / "report.json"
+@pytest.mark.parametrize("name", ["auto", "numpy", "native"])
+def test_the_engine_is_ignored_with_a_note(name: str) -> None:
     capture = TWO_LIDARS / "two_lidars.pcap"
     rig = TWO_LIDARS / "rig.yaml"
-    words: list[str | Path] = ["--rig", rig, "--dry-run", "--engine", "numba", "--report", report]
-    done = command("convert", capture, *words)
+    done = command("convert", capture, "--rig", rig, "--dry-run", "--engine", name)
     assert done.code == 0
-    assert "mlbatch: --engine numba is now native" in done.err
-    assert json.loads(report.read_text(encoding="utf-8"))["timing"]["engine"] == "native"
+    assert "mlbatch: --engine is ignored, since everything is compiled" in done.err
 
 
-def test_the_version_says_which_engine_is_used(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_version_says_whether_the_library_is_there(monkeypatch: pytest.MonkeyPatch) -> None:
     assert command("--version").out == f"mlbatch {mlbatch.__version__}\n"
     monkeypatch.setattr(library, "trouble", lambda: "")
-    assert command("--version", "-v").out.splitlines()[1] == "engine native"
+    assert command("--version", "-v").out.splitlines()[1] == "compiled library: found"
     monkeypatch.setattr(library, "trouble", lambda: "none")
     line = command("--version", "--verbose").out.splitlines()[1]
     assert line == "no compiled library: none; reinstall mlbatch, which compiles it"

@@ -9,10 +9,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mlbatch.batching.reference import FeedPacket, Outcome, Settings, reference_scans
 from mlbatch.errors import ClockError
 from tests.builders.fast import run_fast
 from tests.builders.feeds import Case, feeds, groups, interleavings, random_feed
+from tests.reference.batching import FeedPacket, Outcome, Settings, reference_scans
 
 SEEDS_A_BLOCK = 250
 BLOCKS = range(20)

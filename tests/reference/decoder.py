@@ -17,7 +17,6 @@ from typing import TypeAlias
 import numpy as np
 
 from mlbatch.arrays import F64Array, I64Array, U8Array
-from mlbatch.decode.arena_ring import ArenaRing
 from mlbatch.decode.packet_ring import PacketRing
 from mlbatch.decode.source import Source
 from mlbatch.lidar.geometry import BeamTable
@@ -136,7 +135,7 @@ class LiteralDecoder:
         return inside, unsure
 
 
-def record_of(ring: PacketRing | ArenaRing, ring_index: int) -> U8Array:
+def record_of(ring: PacketRing, ring_index: int) -> U8Array:
     """Bytes of a column."""
     view, origin = ring.view
     rows, per_row = view.shape

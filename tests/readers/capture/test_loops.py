@@ -10,7 +10,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mlbatch.decode.packet_ring import packet_sums
 from mlbatch.errors import RecordingError
 from mlbatch.native.capture import CaptureLoops
 from tests.builders.captures import pcap_bytes, udp_frame
@@ -80,15 +79,38 @@ def test_bytes_beyond_the_buffer_are_not_walked(begin: int, end: int) -> None:
         CaptureLoops().walk(np.zeros(100, np.uint8), begin, end, False, 1, 1 << 18)
 
 
+def _sum(payload: bytes) -> int:
+    """Sum of the words of 8 bytes, and of the last 8 bytes if these are no word."""
+    if len(payload) < 8:
+        return sum(payload)
+    words = [payload[at : at + 8] for at in range(0, len(payload) - 7, 8)]
+    words += [payload[-8:]] * bool(len(payload) % 8)
+    return sum(int.from_bytes(word, "little") for word in words) % 2**64
+
+
+@pytest.mark.parametrize("size", [1, 7, 8, 9, 15, 16, 23])
+def test_every_change_of_a_byte_changes_the_sum(size: int) -> None:
+    """Also by the top bit of a byte, which could overflow the sum."""
+    packet = np.full(size, 0x7F, np.uint8)
+    changed = [
+        np.where(np.arange(size) == at, 0x7F ^ flip, packet)
+        for at in range(size)
+        for flip in range(1, 256)
+    ]
+    data = np.concatenate([packet, *changed]).astype(np.uint8)
+    sums = CaptureLoops().sums(data, np.arange(len(changed) + 1) * size, size)
+    assert not (sums[1:] == sums[0]).any()
+
+
 @given(size=st.integers(1, 70), seed=st.integers(0, 2**32), data=st.data())
-def test_sums_of_packets_are_those_of_numpy(size: int, seed: int, data: st.DataObject) -> None:
+def test_sums_are_those_of_words(size: int, seed: int, data: st.DataObject) -> None:
     content = np.random.default_rng(seed).integers(0, 256, 200, np.uint8)
     # The last packet may end with the array.
     begins = data.draw(st.lists(st.integers(0, len(content) - size), max_size=9))
     start = np.array([*begins, len(content) - size])
-    packets = np.stack([content[begin : begin + size] for begin in start])
+    packets = [content[begin : begin + size].tobytes() for begin in start]
     found = CaptureLoops().sums(content, start, size)
-    assert found.tolist() == packet_sums(packets).tolist()
+    assert found.tolist() == [_sum(packet) for packet in packets]
     assert CaptureLoops().sums(content, start[:0], size).tolist() == []
 
 

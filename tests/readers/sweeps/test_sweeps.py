@@ -376,12 +376,12 @@ def test_a_rig_of_inspect_describes_the_same_folder(shell: Shell) -> None:
     np.testing.assert_array_equal(_xyz("again"), expected)
 
 
-def test_engines_and_jobs_give_the_same_files(shell: Shell) -> None:
+def test_jobs_give_the_same_files(shell: Shell) -> None:
     write_sweeps(Path("drive/top"), _names())
     _rig(GLOB)
     found = set()
-    for engine, jobs in (("numpy", 1), ("auto", 1), ("auto", 2)):
-        options = f"--engine {engine} --jobs {jobs} --overwrite"
+    for jobs in (1, 2):
+        options = f"--jobs {jobs} --overwrite"
         assert shell(f"convert drive --rig rig.yaml -o out {options}").code == 0
         found.add(b"".join(path.read_bytes() for path in scan_files(Path("out"))))
     assert len(found) == 1
