@@ -8,7 +8,8 @@ import numpy as np
 import numpy.typing as npt
 
 from mlbatch.arrays import I64Array, U8Array, U64Array
-from mlbatch.lidar.interface import Records
+from mlbatch.lidar.headers import Headers
+from mlbatch.lidar.interface import Lidar, Records
 from mlbatch.native.arena import PacketArena
 from mlbatch.native.capture import CaptureLoops
 
@@ -139,3 +140,22 @@ class PacketRing:
             strides=(1, 1),
         )
         return pieces, self._arena.origin, data
+
+
+def headers_of(
+    lidar: Lidar, ring: PacketRing, kept: KeptPackets, host_ns: I64Array, keys: I64Array | None
+) -> Headers:
+    """Headers of packets that a ring has kept last, received at host_ns (P,).
+
+    keys: (P,) hashes of their contents, None: not known.
+    """
+    if lidar.reader is not None:
+        return lidar.reader.read(kept.data, kept.start, host_ns, keys)
+    packets = ring.packets(kept)
+    return Headers(
+        lidar.sent_by_me(packets),
+        lidar.faults(packets),
+        lidar.sequence(packets),
+        lidar.column_headers(packets, host_ns),
+        is_usual=False,
+    )

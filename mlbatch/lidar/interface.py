@@ -8,7 +8,7 @@ from typing import NamedTuple, Protocol, runtime_checkable
 
 from mlbatch.arrays import BoolArray, F64Array, I64Array, U8Array
 from mlbatch.lidar.geometry import BeamTable
-from mlbatch.lidar.header_table import HeaderTable
+from mlbatch.lidar.headers import HeaderReader
 from mlbatch.lidar.pixel_table import PixelTable
 from mlbatch.lidar.projections import Projection
 from mlbatch.types import ColumnHeaders, ImuSamples, Stream
@@ -139,8 +139,8 @@ class Lidar(Protocol):
     records: Records
     # Readings of the pixels of a record; None: it has coordinates (`projection`).
     pixels: PixelTable | None
-    # Layout of the headers for compiled loops; None: only numpy reads them.
-    headers: HeaderTable | None
+    # Reads headers by compiled loops; None: the methods below read them.
+    reader: HeaderReader | None
     # The sequence number wraps there; 0: packets have none.
     sequence_modulus: int
     # Destination port of IMU packets; 0: unknown.

@@ -25,9 +25,10 @@ _FUNCTIONS: dict[str, tuple[type[Any], ...]] = {
     "mlbatch_angles": (_WORD, _ADDRESS, _ADDRESS, _ADDRESS),
     "mlbatch_merge": (_WORD, _ADDRESS, _WORD, *[_ADDRESS] * 5),
     "mlbatch_figures": (_WORD, *[_ADDRESS] * 4, _WORD, _ADDRESS, _WORD, _ADDRESS, _ADDRESS),
-    "mlbatch_stamped": (_ADDRESS, _ADDRESS, _WORD, *[_ADDRESS] * 4),
-    "mlbatch_paced": (_ADDRESS, _ADDRESS, _WORD, *[_ADDRESS] * 5),
-    "mlbatch_single": (_ADDRESS, _WORD, _ADDRESS, *[_WORD] * 3, *[_ADDRESS] * 3),
+    "mlbatch_headers": (
+        *(_WORD, _ADDRESS, _ADDRESS, _WORD, _ADDRESS, _WORD, _WORD, _ADDRESS, _WORD),
+        *[_ADDRESS] * 8,
+    ),
     "mlbatch_walk": (_ADDRESS, *[_WORD] * 6, _ADDRESS, _ADDRESS),
     "mlbatch_dissect": (_ADDRESS, _ADDRESS, _WORD, _WORD, *[_ADDRESS] * 5),
     "mlbatch_keep": (_ADDRESS, _ADDRESS, _WORD, _ADDRESS, _WORD),
@@ -221,62 +222,6 @@ class Part(ctypes.Structure):
         ("stamp_ns", _ADDRESS),
         ("ring_index", _ADDRESS),
         ("encoder", _ADDRESS),
-    ]
-
-
-class Check(ctypes.Structure):
-    """A number that all packets of a sensor share."""
-
-    _fields_: ClassVar = [("first", _WORD), ("bytes", _WORD), ("value", _WORD)]
-
-
-class StampedLayout(ctypes.Structure):
-    """Packets whose columns have a timestamp and a position each."""
-
-    _fields_: ClassVar = [
-        ("columns", _WORD),
-        ("first_column", _WORD),
-        ("column_bytes", _WORD),
-        ("position_at", _WORD),
-        ("positions", _WORD),
-        ("status_at", _WORD),
-        ("frame_at", _WORD),
-        ("frame_bytes", _WORD),
-        ("frames", _WORD),
-        ("has_frames", _WORD),
-        ("rank", _ADDRESS),
-        ("packets_per_frame", _WORD),
-        ("check_count", _WORD),
-        ("checks", _ADDRESS),
-    ]
-
-
-class PacedLayout(ctypes.Structure):
-    """Packets with a timestamp, and blocks with an azimuth."""
-
-    _fields_: ClassVar = [
-        ("columns", _WORD),
-        ("groups", _WORD),
-        ("blocks_per_group", _WORD),
-        ("block_count", _WORD),
-        ("block_bytes", _WORD),
-        ("flags", _ADDRESS),
-        ("circle", _WORD),
-        ("widest", _WORD),
-        ("stamp_at", _WORD),
-        ("period_ns", _WORD),
-        ("offset_ns", _WORD),
-        ("mode_at", _WORD),
-        ("modes", _ADDRESS),
-        ("packet_bytes", _WORD),
-        ("odd", _ADDRESS),
-        ("start_ns", _ADDRESS),
-        ("ahead_ns", _ADDRESS),
-        ("group_ns", _NUMBER),
-        ("known_speed", _NUMBER),
-        ("per_s", _NUMBER),
-        ("steps_per_hz", _NUMBER),
-        ("follows_rotor", _WORD),
     ]
 
 

@@ -265,59 +265,6 @@ typedef struct {
     const int64_t *encoder;
 } Part;
 
-/* A little-endian number of a packet that all packets of a sensor share. */
-typedef struct {
-    int64_t first; /* first byte */
-    int64_t bytes;
-    int64_t value;
-} Check;
-
-/* Packets whose columns have a timestamp and a position each: `lidar/header_table.py`. Columns are
-   `column_bytes` apart; bytes are those of a column, or (frame_at) of the packet. */
-typedef struct {
-    int64_t columns; /* of a packet */
-    int64_t first_column;
-    int64_t column_bytes;
-    int64_t position_at;
-    int64_t positions; /* of a revolution */
-    int64_t status_at;
-    int64_t frame_at;
-    int64_t frame_bytes;
-    int64_t frames;     /* frame numbers wrap there */
-    int64_t has_frames; /* each column has a frame number of two bytes, and they have to agree */
-    const int64_t *rank; /* (positions / columns,) of the packets of a frame; -1: not sent */
-    int64_t packets_per_frame;
-    int64_t check_count;
-    const Check *checks;
-} StampedLayout;
-
-/* Packets with a timestamp, and blocks with an azimuth in bytes 2 and 3: `lidar/header_table.py`.
-   A group of blocks has one azimuth, and is one column or several. */
-typedef struct {
-    int64_t columns;
-    int64_t groups;
-    int64_t blocks_per_group;
-    int64_t block_count;
-    int64_t block_bytes;
-    const int64_t *flags; /* (block_count,) in bytes 0 and 1 */
-    int64_t circle;       /* azimuths of a revolution */
-    int64_t widest;       /* step between groups without a gap */
-    int64_t stamp_at;     /* 4 bytes, microseconds */
-    int64_t period_ns;    /* of the timestamps */
-    int64_t offset_ns;    /* true time minus receive time */
-    int64_t mode_at;
-    const uint8_t *modes; /* (256,) allowed ones, or NULL */
-    int64_t packet_bytes;
-    const uint64_t *odd;      /* (words,): `lidar/content_keys.py` */
-    const int64_t *start_ns;  /* (columns,) after the packet's timestamp */
-    const double *ahead_ns;   /* (columns,) after the azimuth of their group */
-    double group_ns;
-    double known_speed; /* azimuths in a ns, of packets with one group */
-    double per_s;       /* revolutions in a s, of one azimuth in a ns */
-    double steps_per_hz;
-    int64_t follows_rotor;
-} PacedLayout;
-
 /* Words of 8 bytes that identify a stream, and a set of fragments. */
 #define STREAM_WORDS 3
 #define KEY_WORDS 5
@@ -408,15 +355,12 @@ EXPORT void mlbatch_figures(int64_t windows, const int64_t *ends, const int64_t 
                             const int64_t *sensor, const int64_t *encoder, int64_t sensors,
                             const int64_t *positions, int64_t sectors, int64_t *entered,
                             int64_t *figures);
-EXPORT int64_t mlbatch_stamped(const StampedLayout *layout, const uint8_t *data, int64_t packets,
-                               const int64_t *start, int64_t *key, int64_t *stamp_ns,
-                               int64_t *encoder);
-EXPORT int64_t mlbatch_paced(const PacedLayout *layout, const uint8_t *data, int64_t packets,
-                             const int64_t *start, const int64_t *host_ns, int64_t *key,
-                             int64_t *stamp_ns, int64_t *encoder);
-EXPORT int64_t mlbatch_single(const uint8_t *data, int64_t packets, const int64_t *start,
-                              int64_t packet_bytes, int64_t first_word, int64_t stamp_at,
-                              const uint64_t *odd, int64_t *key, int64_t *stamp_ns);
+EXPORT int64_t mlbatch_headers(int64_t kind, const void *layout, const uint8_t *data,
+                               int64_t packets, const int64_t *start, int64_t packet_bytes,
+                               int64_t columns, const int64_t *host_ns, int64_t has_number,
+                               const uint64_t *odd, const int64_t *keys, uint8_t *is_mine,
+                               uint8_t *fault, int64_t *key, int64_t *stamp_ns, int64_t *encoder,
+                               uint8_t *valid);
 EXPORT int64_t mlbatch_walk(const uint8_t *data, int64_t begin, int64_t end, int64_t is_swapped,
                             int64_t unit_ns, int64_t most_bytes, int64_t room, int64_t *columns,
                             int64_t *stop);

@@ -20,7 +20,7 @@ from mlbatch.decode.decoder import Decoder, Source
 from mlbatch.discovery.types import Note
 from mlbatch.errors import NoScanError, PacketError, UsageError
 from mlbatch.pipeline import run_report
-from mlbatch.pipeline.decode_pool import DecodePool, DecodeTask, with_own_lidars
+from mlbatch.pipeline.decode_pool import DecodePool, DecodeTask
 from mlbatch.pipeline.job import DEFAULT_RATE, Job
 from mlbatch.pipeline.passthrough import Passthrough
 from mlbatch.pipeline.point_notes import refuse_all_removed
@@ -194,7 +194,7 @@ class Conversion:
         """A decoder for the thread that batches: dense scans of all sensors, with columns."""
         # There is a window, so that the clocks are known.
         info = self._run_info()._replace(layout="dense", sort="columns")
-        sources = with_own_lidars([sensor.source() for sensor in self.sensors])
+        sources = [sensor.source() for sensor in self.sensors]
         boxes_m = self.session.boxes_m
         extras = frozenset({"column"})
         return Decoder(info, sources, boxes_m, extras)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from copy import deepcopy
 from dataclasses import dataclass, replace
 from typing import NamedTuple, TypeAlias
 
@@ -122,21 +121,15 @@ class DecodePool:
         counts_clipped: bool = False,
         own_times: bool = False,
     ) -> None:
-        """workers: one a thread; each has lidars of its own if there are several.
+        """workers: one a thread.
 
         own_times: times of points count from the first column of their sensor.
-        Lidars have scratch memory, and the feeding thread reads column headers with them.
         """
         self._rings = [source.ring for source in sources]
         self._split = split
         self._own_times = own_times
         self._open: list[DecodeTask] = []
-        self.workers = [
-            DecodeWorker(
-                with_own_lidars(sources) if workers > 1 else sources, split, new, counts_clipped
-            )
-            for _ in range(workers)
-        ]
+        self.workers = [DecodeWorker(sources, split, new, counts_clipped) for _ in range(workers)]
 
     def tasks(self, window: Window) -> Iterator[DecodeTask]:
         """Yield the tasks of a window: one, or with `--split` one for each sensor in it."""
@@ -210,8 +203,3 @@ def _last(sensors: I64Array, sensor: int) -> int | None:
         if len(own):
             return max(0, len(sensors) - count) + int(own[-1])
     return None
-
-
-def with_own_lidars(sources: Sequence[Source]) -> list[Source]:
-    """The same sources with copies of their lidars; rings are shared."""
-    return [replace(source, lidar=deepcopy(source.lidar)) for source in sources]

@@ -9,7 +9,7 @@ import numpy as np
 
 from mlbatch.arrays import BoolArray, I64Array, U8Array
 from mlbatch.batching.intake import Arrival, rises
-from mlbatch.decode.packet_ring import KeptPackets
+from mlbatch.decode.packet_ring import headers_of
 from mlbatch.discovery.crowd import Crowd
 from mlbatch.discovery.router import Role, Router
 from mlbatch.discovery.sampler import SAMPLES_PER_KIND, split_by_kind
@@ -167,70 +167,37 @@ class Ingest:
     def _arrive(
         self, sensor: Sensor, batch: PacketBatch, index: I64Array, owned: BoolArray
     ) -> Arrival:
-        """Keep packets that may be of a sensor; give those that are, and are valid."""
-        kept = sensor.ring.keep(batch.data, batch.start[index], batch.place)
-        usual = self._arrive_usual(sensor, batch, index, owned, kept)
-        if usual is not None:
-            return usual
+        """Keep packets that may be of a sensor; give those that are, and are good."""
         lidar = sensor.lidar
         counts = sensor.ledger.packets
-        packets = sensor.ring.packets(kept)
-        ring_index = kept.ring_index
-        good = lidar.sent_by_me(packets) & ~owned[index]
+        kept = sensor.ring.keep(batch.data, batch.start[index], batch.place)
+        host_ns = batch.host_ns[index]
+        keys = None if batch.content_key is None else batch.content_key[index]
+        found = headers_of(lidar, sensor.ring, kept, host_ns, keys)
+        good = found.is_mine & ~owned[index]
         counts.read += int(np.count_nonzero(good))
         owned[index] |= good
-        faults = lidar.faults(packets)
-        if faults.any():
-            for fault, count in enumerate(np.bincount(faults[good])[1:].tolist(), 1):
+        if not found.is_usual:
+            for fault, count in enumerate(np.bincount(found.faults[good])[1:].tolist(), 1):
                 counts.reject(FAULTS[fault], count)
-            good &= faults == 0
-        if not good.all():
-            packets = packets[good]
-            ring_index = ring_index[good]
-            index = index[good]
-        host_ns = batch.host_ns[index]
-        headers = lidar.column_headers(packets, host_ns)
-        if self._stamp_map is not None:
-            headers.stamp_ns = self._stamp_map(sensor, headers.stamp_ns, host_ns)
-        return Arrival(
+            good &= found.faults == 0
+        arrival = Arrival(
             position=index,
             host_ns=host_ns,
-            key=lidar.sequence(packets),
-            headers=headers,
-            ring_index=ring_index,
-            column_offsets=sensor.ring.column_offsets(lidar.columns_per_packet),
-            is_rising=rises(headers),
-        )
-
-    def _arrive_usual(
-        self,
-        sensor: Sensor,
-        batch: PacketBatch,
-        index: I64Array,
-        owned: BoolArray,
-        kept: KeptPackets,
-    ) -> Arrival | None:
-        """Packets that compiled loops read; None unless they can read all, which then are good."""
-        if sensor.loops is None or self._stamp_map is not None or owned[index].any():
-            return None
-        lidar = sensor.lidar
-        host_ns = batch.host_ns[index]
-        known = None if batch.content_key is None else batch.content_key[index]
-        found = sensor.loops.read(kept.data, kept.start, lidar.packet_size, host_ns, known)
-        if found is None:
-            return None
-        headers, key = found
-        sensor.ledger.packets.read += len(index)
-        owned[index] = True
-        return Arrival(
-            position=index,
-            host_ns=host_ns,
-            key=key,
-            headers=headers,
+            key=found.key,
+            headers=found.columns,
             ring_index=kept.ring_index,
             column_offsets=sensor.ring.column_offsets(lidar.columns_per_packet),
-            is_rising=True,
+            is_rising=found.is_usual,
         )
+        if not good.all():
+            arrival = arrival.take(good)
+        headers = arrival.headers
+        if self._stamp_map is not None:
+            headers.stamp_ns = self._stamp_map(sensor, headers.stamp_ns, arrival.host_ns)
+        if self._stamp_map is not None or not found.is_usual:
+            arrival.is_rising = rises(headers)
+        return arrival
 
     def _imu(self, batch: PacketBatch, index: I64Array, sensor: Sensor) -> list[ImuSamples]:
         """Samples of IMU packets; duplicates are counted and left out."""

@@ -10,7 +10,6 @@ from mlbatch.batching.fill import Pace
 from mlbatch.batching.intake import Intake
 from mlbatch.clocks.timescale import timescale
 from mlbatch.clocks.watch import ClockWatch
-from mlbatch.decode.native_headers import HeaderLoops
 from mlbatch.decode.packet_ring import PacketRing
 from mlbatch.decode.source import Source
 from mlbatch.discovery.types import DetectedSensor
@@ -69,7 +68,6 @@ class Sensor:
     ring_base: int  # first ring number of its channels
     columns_per_s: float | None  # nominal rate, None if unknown
     ring: PacketRing  # raw packets until their window closes
-    loops: HeaderLoops | None  # read headers that are as usual; None: numpy reads all
     ledger: SensorLedger = field(default_factory=SensorLedger)
 
     @property
@@ -141,11 +139,6 @@ class Sensor:
     def unread(self, arena: PacketArena) -> Sensor:
         """The same sensor with an empty ring and ledger, for a pass of its own."""
         return replace(self, ring=new_ring(self.lidar, arena), ledger=SensorLedger())
-
-
-def header_loops(lidar: Lidar) -> HeaderLoops | None:
-    """Compiled loops for the headers of a lidar's packets; None if it has none."""
-    return None if lidar.headers is None else HeaderLoops(lidar.headers)
 
 
 def new_ring(lidar: Lidar, arena: PacketArena) -> PacketRing:

@@ -22,7 +22,7 @@ from mlbatch.pipeline.clock_monitor import ClockMonitor
 from mlbatch.pipeline.ingest import Ingest
 from mlbatch.pipeline.job import Job
 from mlbatch.pipeline.segments import ClippedRecording, TimeSegment
-from mlbatch.pipeline.sensor import Limits, Sensor, SensorClock, header_loops, new_ring
+from mlbatch.pipeline.sensor import Limits, Sensor, SensorClock, new_ring
 from mlbatch.readers import merge, open_recordings
 from mlbatch.readers.source import BUFFER_BYTES
 from mlbatch.report.limits import ACCEPTED
@@ -132,7 +132,6 @@ class Session:
             ring_base=ring_base,
             columns_per_s=sampler.columns_per_s(found),
             ring=new_ring(lidar, self._arena),
-            loops=header_loops(lidar),
         )
 
     def _replay(self) -> FaultReplay | None:

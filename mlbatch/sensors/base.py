@@ -7,19 +7,18 @@ import numpy as np
 from mlbatch.arrays import BoolArray, F64Array, I64Array, U8Array
 from mlbatch.lidar.content_keys import content_keys
 from mlbatch.lidar.geometry import BeamTable
-from mlbatch.lidar.header_table import HeaderTable
+from mlbatch.lidar.headers import HeaderReader, Headers
 from mlbatch.lidar.interface import Records
 from mlbatch.lidar.pixel_table import PixelTable
 from mlbatch.lidar.projections import Projection
-from mlbatch.types import ImuSamples
+from mlbatch.types import ColumnHeaders, ImuSamples
 from mlbatch.units import NS_PER_S
 
 
 class BaseLidar:
     """Base class of the vendors' lidars.
 
-    A subclass assigns the attributes that are only declared here and implements `faults`
-    and `column_headers`.
+    A subclass assigns the attributes that are only declared here.
     """
 
     vendor: str
@@ -35,9 +34,10 @@ class BaseLidar:
     firing_ns: I64Array
     beams: BeamTable
     calibration: str
+    # None: a subclass implements the methods that read packets.
+    reader: HeaderReader | None = None
 
     pixels: PixelTable | None = None
-    headers: HeaderTable | None = None
     serial: str = ""
     carries_serial: bool = False
     has_reflectivity: bool = False
@@ -64,13 +64,28 @@ class BaseLidar:
         """Columns sent in a second: one a period."""
         return NS_PER_S / self.column_period_ns if self.column_period_ns else 0.0
 
+    def _read(self, packets: U8Array, host_ns: I64Array | None = None) -> Headers:
+        if self.reader is None:
+            raise TypeError(f"{type(self).__name__}: expected a reader, or methods of its own")
+        return self.reader.read_rows(packets, host_ns)
+
     def sent_by_me(self, packets: U8Array) -> BoolArray:
-        """All packets: they carry no serial number."""
-        return np.ones(len(packets), np.bool_)
+        """(P,) whether packets have this sensor's serial number, or none."""
+        if self.reader is None:
+            return np.ones(len(packets), np.bool_)
+        return self.reader.read_rows(packets).is_mine
+
+    def faults(self, packets: U8Array) -> U8Array:
+        """(P,) index into FAULTS."""
+        return self._read(packets).faults
 
     def sequence(self, packets: U8Array) -> I64Array:
-        """(P,) hash of the content, equal for equal packets."""
-        return content_keys(packets)
+        """(P,) number of packets; without one, the hash of the content."""
+        return content_keys(packets) if self.reader is None else self._read(packets).key
+
+    def column_headers(self, packets: U8Array, host_ns: I64Array) -> ColumnHeaders:
+        """Timestamps, rotor positions and validity of all columns."""
+        return self._read(packets, host_ns).columns
 
     def is_imu(self, size: int) -> bool:
         """No IMU packets."""

@@ -1,4 +1,4 @@
-"""Headers of packets, read by compiled loops and by numpy."""
+"""Headers of packets, read by the compiled loops and literally."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ from typing import cast
 import numpy as np
 
 from mlbatch.arrays import I64Array, U8Array
-from mlbatch.batching.intake import rises
-from mlbatch.decode.native_headers import HeaderLoops
+from mlbatch.lidar.content_keys import content_keys
+from mlbatch.lidar.headers import Headers
 from mlbatch.lidar.interface import Lidar
 from mlbatch.sensors.ouster.sensor import read_calibration
-from mlbatch.types import ColumnHeaders
 from tests.builders.ouster import OusterSpec, encode_packets, metadata_json
+from tests.reference.headers import read
 
 
 def ouster_packets(spec: OusterSpec, columns: int = 48) -> tuple[Lidar, U8Array]:
@@ -29,29 +29,26 @@ def ouster_packets(spec: OusterSpec, columns: int = 48) -> tuple[Lidar, U8Array]
     return lidar, np.array([np.frombuffer(packet, np.uint8) for packet in packets])
 
 
-def read_by_loops(
-    lidar: Lidar, packets: U8Array, host_ns: I64Array
-) -> tuple[ColumnHeaders, I64Array] | None:
-    """What the loops read; packets begin at any byte of a buffer, and nothing follows them."""
-    assert lidar.headers is not None
+def check_headers(lidar: Lidar, packets: U8Array, host_ns: I64Array) -> Headers:
+    """The loops read what the packets literally say; those begin at any byte of a buffer."""
+    assert lidar.reader is not None
     size = packets.shape[1]
     buffer = np.concatenate([np.zeros(3, np.uint8), packets.reshape(-1)])
-    start = 3 + np.arange(len(packets)) * size
-    return HeaderLoops(lidar.headers).read(buffer, start, size, host_ns)
-
-
-def same_as_numpy(lidar: Lidar, packets: U8Array, host_ns: I64Array) -> bool:
-    """Whether the loops read these packets; if so, numpy has to read the same."""
-    found = read_by_loops(lidar, packets, host_ns)
-    if found is None:
-        return False
-    headers, key = found
-    expected = lidar.column_headers(packets, host_ns)
-    assert lidar.sent_by_me(packets).all()
-    assert not lidar.faults(packets).any()
-    assert rises(expected)
-    np.testing.assert_array_equal(headers.stamp_ns, expected.stamp_ns)
-    np.testing.assert_array_equal(headers.encoder, expected.encoder)
-    np.testing.assert_array_equal(headers.valid, expected.valid)
-    np.testing.assert_array_equal(key, lidar.sequence(packets))
-    return True
+    found = lidar.reader.read(buffer, 3 + np.arange(len(packets)) * size, host_ns)
+    hashes = content_keys(packets).tolist()
+    newest, is_usual = -(1 << 63), len(packets) > 0
+    for row, packet in enumerate(packets):
+        seen = read(lidar.reader.table, packet.tobytes(), int(host_ns[row]))
+        assert (bool(found.is_mine[row]), int(found.faults[row])) == (seen.is_mine, seen.fault)
+        is_usual &= seen.is_mine and not seen.fault
+        if not seen.is_mine or seen.fault:
+            continue
+        assert int(found.key[row]) == (hashes[row] if seen.key is None else seen.key)
+        columns = found.columns
+        arrays = (columns.stamp_ns, columns.encoder, columns.valid)
+        assert list(zip(*(one[row].tolist() for one in arrays), strict=True)) == seen.columns
+        for stamp_ns, _, valid in seen.columns:
+            is_usual &= valid and stamp_ns >= newest
+            newest = stamp_ns
+    assert found.is_usual == is_usual
+    return found

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from mlbatch.arrays import I64Array, U8Array
+from mlbatch.arrays import U8Array
 from mlbatch.batching.merge import ColumnMerge
 from mlbatch.decode.decoder import ScanHeader
 from mlbatch.decode.packet_ring import PacketRing
@@ -40,7 +40,7 @@ from mlbatch.types import (
 )
 from tests.builders.captures import udp_frame
 from tests.builders.engines import BOXES_M, Pair
-from tests.builders.headers import ouster_packets, same_as_numpy
+from tests.builders.headers import check_headers, ouster_packets
 from tests.builders.ouster import OusterSpec
 from tests.builders.velodyne import VelodyneSpec
 from tests.builders.velodyne_streams import PLAIN, made_of
@@ -170,7 +170,7 @@ def _read_headers(data: bytes, folder: Path) -> None:
     lidar, packets = _headed()[number % len(_headed())]
     whole = np.frombuffer(data[_HEAD.size :].ljust(packets.size, b"\0")[: packets.size], np.uint8)
     host_ns = START_NS + 10**9 * np.arange(len(packets)) * (number % 41)
-    same_as_numpy(lidar, whole.reshape(packets.shape), host_ns)
+    check_headers(lidar, whole.reshape(packets.shape), host_ns)
 
 
 # -- frames ---------------------------------------------------------------------------------------

@@ -13,10 +13,10 @@ from pathlib import Path
 
 import numpy as np
 
-from mlbatch.arrays import F64Array, I64Array, U8Array, median
+from mlbatch.arrays import F64Array, median
 from mlbatch.errors import RigError
-from mlbatch.lidar.content_keys import content_keys
 from mlbatch.lidar.geometry import BeamTable, spherical
+from mlbatch.lidar.headers import HeaderReader
 from mlbatch.lidar.interface import Calibration, Evidence, SensorModel
 from mlbatch.lidar.projections import Projection
 from mlbatch.sensors.base import BaseLidar
@@ -27,10 +27,16 @@ from mlbatch.sensors.hesai.identify import describe, identify
 from mlbatch.sensors.hesai.layout import Layout
 from mlbatch.sensors.hesai.models import Model
 from mlbatch.sensors.hesai.optics import axis_ranges, off_axis
-from mlbatch.sensors.hesai.packets import PacketReader
+from mlbatch.sensors.hesai.packets import (
+    firing_tables,
+    first_azimuths,
+    header_table,
+    pixels,
+    records_of,
+    wrong_crc,
+)
 from mlbatch.sensors.nominal import apart_deg, refuse_other_beams
 from mlbatch.sensors.options import check_options
-from mlbatch.types import ColumnHeaders
 from mlbatch.units import M_PER_MM, RAD_PER_DEG
 
 __all__ = ["BUILT_IN", "MODELS", "VENDOR", "HesaiCalibration", "HesaiLidar", "describe"]
@@ -159,12 +165,13 @@ class HesaiLidar(BaseLidar):
     ) -> None:
         """centre_m: (3,) optical centre; None: beams leave from the axis."""
         model = layout.model
-        self._reader = PacketReader(
-            layout,
-            follows_rotor=_is_on(options, "firing_azimuth", "on"),
-            checks_crc="crc" in options,
+        follows_rotor = _is_on(options, "firing_azimuth", "on")
+        table = header_table(layout, sense=_sense(layout, evidence), follows_rotor=follows_rotor)
+        self.reader = HeaderReader(
+            table,
+            has_number=layout.sequence_at is not None,
+            wrong_crc=(lambda packets: wrong_crc(packets, layout)) if "crc" in options else None,
         )
-        self._reader.sense = _sense(self._reader, evidence)
         self.vendor = VENDOR
         self.model = model.name
         self.mode = layout.mode.text
@@ -173,11 +180,11 @@ class HesaiLidar(BaseLidar):
         self.packet_size = layout.size
         self.columns_per_packet = layout.columns
         self.column_period_ns = model.timing.step_ns / model.timing.divisor
-        self.records = self._reader.records
-        self.pixels = self._reader.pixels()
+        self.records = records_of(layout)
+        self.pixels = pixels(layout)
         self.return_types = layout.mode.types
         self.channel = np.arange(model.channels)
-        self.firing_ns = self._reader.firing_ns
+        self.firing_ns, _ = firing_tables(model)
         self.calibration = str(angles.path)
         self.sequence_modulus = layout.sequence_modulus
         direction = spherical(angles.azimuth_rad, angles.elevation_rad, clockwise_from="y")
@@ -187,19 +194,6 @@ class HesaiLidar(BaseLidar):
         self.beams = self._on_axis
         if centre_m is not None:
             self.beams = off_axis(self._on_axis, centre_m, from_centre=model.from_centre)
-
-    def faults(self, packets: U8Array) -> U8Array:
-        """(P,) index into FAULTS."""
-        return self._reader.faults(packets)
-
-    def sequence(self, packets: U8Array) -> I64Array:
-        """(P,) UDP sequence number; without one, a hash of the content."""
-        found = self._reader.sequence(packets)
-        return content_keys(packets) if found is None else found
-
-    def column_headers(self, packets: U8Array, host_ns: I64Array) -> ColumnHeaders:
-        """Timestamps and rotor words; packets carry the date, so host_ns is not used."""
-        return self._reader.column_headers(packets)
 
     def projection(self, body_from_sensor: F64Array) -> Projection | None:
         """Projection of off-axis beams whose ranges count from the axis; else None."""
@@ -267,9 +261,9 @@ def _note_on_beams(angles: HesaiAngles, model: Model) -> str:
     )
 
 
-def _sense(reader: PacketReader, evidence: Evidence | None) -> int:
+def _sense(layout: Layout, evidence: Evidence | None) -> int:
     """1 for a clockwise rotor, seen from above; -1 for a counter-clockwise one."""
     if evidence is None or len(evidence.sample) < 2:
         return 1
-    step = np.diff(reader.azimuth_revolutions(evidence.sample[:_PACKETS_IN_A_ROW]))
+    step = np.diff(first_azimuths(evidence.sample[:_PACKETS_IN_A_ROW], layout))
     return -1 if median(step - np.rint(step)) < 0 else 1

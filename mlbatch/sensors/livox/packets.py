@@ -15,8 +15,8 @@ from typing import TypeAlias
 import numpy as np
 import numpy.typing as npt
 
-from mlbatch.arrays import F32Array, F64Array, I64Array, U8Array
-from mlbatch.lidar.interface import FAULTS
+from mlbatch.arrays import BoolArray, F32Array, F64Array, U8Array
+from mlbatch.lidar.headers import EvenColumns, checks
 from mlbatch.lidar.projections import Coordinates
 from mlbatch.types import ImuSamples
 from mlbatch.units import RAD_PER_DEG, STANDARD_GRAVITY
@@ -42,8 +42,6 @@ HEADER = np.dtype(
 Points: TypeAlias = npt.NDArray[np.void]
 _NS_PER_INTERVAL = 100
 _CRC_FROM = 28
-_BAD_HEADER = FAULTS.index("bad_header")
-_BAD_CRC = FAULTS.index("bad_crc")
 _INTENSITY = [("intensity", "u1"), ("tag", "u1")]
 _CARTESIAN32 = np.dtype([("xyz", "<i4", 3), *_INTENSITY])
 _CARTESIAN16 = np.dtype([("xyz", "<i2", 3), *_INTENSITY])
@@ -81,32 +79,44 @@ def headers(packets: U8Array) -> npt.NDArray[np.void]:
     return np.ascontiguousarray(packets[:, :HEADER_SIZE]).view(HEADER)[:, 0]
 
 
-def faults(packets: U8Array, kind: PointKind, *, check_crc: bool) -> U8Array:
-    """(P,) index into FAULTS: `bad_header` for other kinds of points, `bad_crc` for damage."""
+def has_points(packets: U8Array, kind: PointKind) -> BoolArray:
+    """(P,) whether packets have points of a kind."""
     head = headers(packets)
     size = packets.shape[1]
     good = (head["data_type"] == kind.data_type) & (head["size"] == size)
     good &= head["points"] == (size - HEADER_SIZE) // kind.size
-    found = np.where(good, 0, _BAD_HEADER).astype(np.uint8)
-    if check_crc:
-        # Less than a microsecond each, a fraction of the decoding of their points.
-        crc = [zlib.crc32(packet[_CRC_FROM:].tobytes()) for packet in packets]
-        found[good & (head["crc"] != np.array(crc, np.uint32))] = _BAD_CRC
-    return found
+    return np.asarray(good, np.bool_)
 
 
-def stamps_ns(packets: U8Array, points: int) -> I64Array:
-    """(P, points) timestamps, spread evenly over the interval stated in the packet.
+def header_table(kind: PointKind, size: int, points: int, is_counted: bool) -> EvenColumns:
+    """Layout of the headers of packets with so many points.
 
-    The interval is divided by the number of points, as in the vendor's driver; the protocol
-    defines it as the time between the first and the last point.
+    Their times are spread evenly over the interval stated in the packet. It is divided by the
+    number of points, as in the vendor's driver; the protocol defines it as the time between the
+    first and the last point.
     """
-    head = headers(packets)
-    interval_ns = head["interval"].astype(np.int64)[:, None] * _NS_PER_INTERVAL
-    # Timestamps of damaged packets may exceed int64: they become negative and are rejected.
-    first_ns = head["stamp_ns"].astype(np.int64)[:, None]
-    stamp_ns: I64Array = first_ns + interval_ns * np.arange(points) // points
-    return stamp_ns
+    at = {name: place for name, (_, place, *_) in (HEADER.fields or {}).items()}
+    return EvenColumns(
+        packet_bytes=size,
+        columns=points,
+        check_count=3,
+        checks=checks(
+            (at["data_type"], 1, kind.data_type), (at["size"], 2, size), (at["points"], 2, points)
+        ),
+        stamp_at=at["stamp_ns"],
+        interval_at=at["interval"],
+        interval_ns=_NS_PER_INTERVAL,
+        counter_at=at["counter"] if is_counted else -1,
+        ring_at=-1,
+        rings=1,
+    )
+
+
+def wrong_crc(packets: U8Array) -> BoolArray:
+    """(P,) whether the checksum of packets is wrong."""
+    # Less than a microsecond each, a fraction of the decoding of their points.
+    crc = [zlib.crc32(packet[_CRC_FROM:].tobytes()) for packet in packets]
+    return np.asarray(headers(packets)["crc"] != np.array(crc, np.uint32))
 
 
 def coordinates(kind: PointKind, body_from_sensor: F64Array) -> Coordinates:

@@ -15,8 +15,8 @@ import numpy as np
 
 from mlbatch.arrays import F64Array, I64Array, U8Array, median
 from mlbatch.errors import RigError
-from mlbatch.lidar.content_keys import content_keys
 from mlbatch.lidar.geometry import BeamTable
+from mlbatch.lidar.headers import HeaderReader
 from mlbatch.lidar.interface import Calibration, Evidence, Records, SensorModel
 from mlbatch.lidar.projections import Coordinates
 from mlbatch.sensors.base import BaseLidar
@@ -26,14 +26,15 @@ from mlbatch.sensors.livox.packets import (
     IMU_SIZE,
     PointKind,
     coordinates,
-    faults,
+    has_points,
+    header_table,
     headers,
     read_imu,
-    stamps_ns,
+    wrong_crc,
 )
 from mlbatch.sensors.options import check_options
 from mlbatch.sensors.packet_bytes import most_common
-from mlbatch.types import ColumnHeaders, ImuSamples
+from mlbatch.types import ImuSamples
 from mlbatch.units import NS_PER_S
 
 __all__ = ["BUILT_IN", "MODELS", "VENDOR", "LivoxCalibration", "LivoxLidar", "describe"]
@@ -104,7 +105,7 @@ class LivoxLidar(BaseLidar):
     """Decoder of one sensor; implements `Lidar`."""
 
     def __init__(self, kind: PointKind, evidence: Evidence, *, check_crc: bool) -> None:
-        packets = evidence.sample[faults(evidence.sample, kind, check_crc=False) == 0]
+        packets = evidence.sample[has_points(evidence.sample, kind)]
         self.vendor = VENDOR
         self.model = SDK2
         self.mode = kind.what
@@ -125,29 +126,18 @@ class LivoxLidar(BaseLidar):
         self.notes = (_SHARED_STAMP,) if _share_stamps(packets) else ()
         # No rotor, hence no dark sectors.
         self.lit_share = 1.0
+        self.reader = HeaderReader(
+            header_table(kind, evidence.size, self.columns_per_packet, bool(self.sequence_modulus)),
+            has_number=bool(self.sequence_modulus),
+            wrong_crc=wrong_crc if check_crc else None,
+        )
         self._packets_per_s = 0.0 if self.notes else _packets_per_s(packets)
         self._kind = kind
-        self._check_crc = check_crc
 
     @property
     def columns_per_s(self) -> float:
         """Points sent in a second, by the first packets."""
         return self.columns_per_packet * self._packets_per_s
-
-    def faults(self, packets: U8Array) -> U8Array:
-        """(P,) index into FAULTS."""
-        return faults(packets, self._kind, check_crc=self._check_crc)
-
-    def sequence(self, packets: U8Array) -> I64Array:
-        """(P,) packet counter; without one, a hash of the content."""
-        if self.sequence_modulus:
-            return headers(packets)["counter"].astype(np.int64)
-        return content_keys(packets)
-
-    def column_headers(self, packets: U8Array, host_ns: I64Array) -> ColumnHeaders:
-        """Timestamps of all points."""
-        stamp_ns = stamps_ns(packets, self.columns_per_packet)
-        return ColumnHeaders(stamp_ns, np.zeros_like(stamp_ns), np.ones(stamp_ns.shape, np.bool_))
 
     def is_imu(self, size: int) -> bool:
         """Whether a payload of this size is an IMU packet."""

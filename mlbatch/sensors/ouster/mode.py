@@ -16,6 +16,7 @@ from mlbatch.errors import RigError
 from mlbatch.sensors.ouster.metadata import REMEDY, Metadata
 from mlbatch.sensors.ouster.packets import Headers, LegacyHeaders
 from mlbatch.sensors.ouster.profiles import ENCODER_TICKS
+from mlbatch.types import ColumnHeaders
 from mlbatch.units import NS_PER_S, NS_PER_US
 
 # Columns of a revolution, and revolutions per second (Firmware User Manual, `lidar_mode`).
@@ -85,9 +86,8 @@ def as_sent(described: Metadata, seen: Seen) -> Metadata:
     return described._replace(lidar_mode=sent, notes=(*described.notes, note))
 
 
-def seen_in(described: Metadata, headers: Headers, packets: U8Array) -> Seen:
-    """What intact packets (P, size) of the unit show; headers: that accept every id."""
-    found = headers.column_headers(packets)
+def seen_in(described: Metadata, headers: Headers, packets: U8Array, found: ColumnHeaders) -> Seen:
+    """What intact packets (P, size) of the unit show; found: their columns, of any id."""
     valid = found.valid
     mid = found.encoder
     if not valid.any():

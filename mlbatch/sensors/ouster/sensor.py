@@ -12,12 +12,12 @@ from pathlib import Path
 
 import numpy as np
 
-from mlbatch.arrays import BoolArray, F64Array, I64Array, U8Array, rows_of
+from mlbatch.arrays import F64Array, I64Array, U8Array, rows_of
 from mlbatch.errors import RigError
 from mlbatch.lidar.geometry import BeamTable
-from mlbatch.lidar.header_table import StampedColumns
+from mlbatch.lidar.headers import HeaderReader
 from mlbatch.lidar.interface import Calibration, Evidence, Records, SensorModel
-from mlbatch.lidar.projections import Projection
+from mlbatch.sensors.base import BaseLidar
 from mlbatch.sensors.options import check_options
 from mlbatch.sensors.ouster.identify import describe
 from mlbatch.sensors.ouster.imu import (
@@ -29,16 +29,16 @@ from mlbatch.sensors.ouster.imu import (
     sample_count,
 )
 from mlbatch.sensors.ouster.metadata import REMEDY, Metadata, parse_metadata, read_document
-from mlbatch.sensors.ouster.mode import as_sent, seen_in
+from mlbatch.sensors.ouster.mode import Seen, as_sent, seen_in
 from mlbatch.sensors.ouster.packets import (
     Headers,
     LegacyHeaders,
     PacketHeaders,
-    first_measurement_ids,
+    wrong_crc,
 )
 from mlbatch.sensors.ouster.pixels import pixel_table
-from mlbatch.sensors.ouster.profiles import FUSA, LEGACY
-from mlbatch.types import ColumnHeaders, ImuSamples
+from mlbatch.sensors.ouster.profiles import FUSA, LEGACY, STANDARD
+from mlbatch.types import ImuSamples
 from mlbatch.units import NS_PER_S
 
 __all__ = [
@@ -101,7 +101,7 @@ def read_calibration(path: Path, content: bytes) -> OusterCalibration | None:
 class OusterCalibration:
     """A metadata file; implements `Calibration`."""
 
-    __slots__ = ("_headers", "is_shared", "metadata", "model", "path", "serial")
+    __slots__ = ("_headers", "_reader", "is_shared", "metadata", "model", "path", "serial")
 
     def __init__(self, described: Metadata) -> None:
         self.metadata = described
@@ -110,7 +110,9 @@ class OusterCalibration:
         self.serial = str(described.serial) if described.serial else ""
         self.is_shared = False
         # Metadata of another mode are refused by an error that says so.
-        self._headers = _headers(described._replace(columns_per_frame=_ANY_IDS), check_crc=False)
+        self._headers = _headers(described._replace(columns_per_frame=_ANY_IDS))
+        table = self._headers.table(_DEFAULT_FRAME_IDS, np.zeros(0, np.int64), 0)
+        self._reader = HeaderReader(table, has_number=True)
 
     def match_score(self, evidence: Evidence) -> int:
         """Match score of packets; old ROS drivers append one byte to payloads."""
@@ -122,7 +124,7 @@ class OusterCalibration:
         if 2 * len(good) <= len(evidence.sample):
             return 0
         try:
-            as_sent(self.metadata, seen_in(self.metadata, self._headers, good))
+            as_sent(self.metadata, self._seen(good))
             mode = _FITS_MODE
         except RigError:
             mode = 0
@@ -139,16 +141,20 @@ class OusterCalibration:
         described = self.metadata
         good = None if evidence is None else self._good(evidence)
         if good is not None and len(good):
-            described = as_sent(described, seen_in(described, self._headers, good))
+            described = as_sent(described, self._seen(good))
             described = described._replace(notes=(*described.notes, *self._other_init_id(good)))
         return OusterLidar(described, self.model, self.serial, "crc" in options)
+
+    def _seen(self, packets: U8Array) -> Seen:
+        """What intact packets of the unit show of its mode."""
+        found = self._reader.read_rows(packets).columns
+        return seen_in(self.metadata, self._headers, packets, found)
 
     def _good(self, evidence: Evidence) -> U8Array:
         """Intact packets of the unit."""
         packets = evidence.sample[:, : self.metadata.layout.packet_size]
-        return rows_of(
-            packets, (self._headers.faults(packets) == 0) & self._headers.sent_by_me(packets)
-        )
+        found = self._reader.read_rows(packets)
+        return rows_of(packets, (found.faults == 0) & found.is_mine)
 
     def _other_init_id(self, packets: U8Array) -> Iterator[str]:
         """A note if packets carry another initialization id than the metadata."""
@@ -177,7 +183,7 @@ class OusterCalibration:
         return _FITS_LIDAR_PORT * on_port + _FITS_IMU_PORT * imu_seen
 
 
-class OusterLidar:
+class OusterLidar(BaseLidar):
     """Decoder of one sensor; implements `Lidar`.
 
     Beyond the protocol: `lidar_port`, `init_id`. The sequence counts the packets within the column
@@ -220,49 +226,24 @@ class OusterLidar:
         self.imu_port = described.imu_port
         self.init_id = described.init_id
         self._metadata = described
-        self._headers = _headers(described, check_crc)
-        self.header_bytes = self._headers.read_bytes()
         self.pixels = pixel_table(layout)
-        self._rank, in_window = _packet_ranks(described)
-        self._frame_ids = _FRAME_IDS.get(described.header, _DEFAULT_FRAME_IDS)
-        self._packets_per_frame = in_window
-        self.sequence_modulus = self._frame_ids * in_window
-        self.headers = self._header_table()
+        rank, in_window = _packet_ranks(described)
+        frame_ids = _FRAME_IDS.get(described.header, _DEFAULT_FRAME_IDS)
+        self.sequence_modulus = frame_ids * in_window
+        # Only packets with STANDARD headers have a checksum.
+        checks = check_crc and not layout.legacy and described.header == STANDARD
+        headers = _headers(described)
+        self._header_bytes = np.array([[0, self.packet_size]]) if checks else headers.read_bytes()
+        self.reader = HeaderReader(
+            headers.table(frame_ids, rank, in_window),
+            has_number=True,
+            wrong_crc=wrong_crc if checks else None,
+        )
 
     @property
-    def columns_per_s(self) -> float:
-        """Columns sent in a second, within the azimuth window."""
-        return NS_PER_S / self.column_period_ns if self.column_period_ns else 0.0
-
-    def _header_table(self) -> StampedColumns | None:
-        """Layout of the headers for compiled loops."""
-        if len(self._rank) * self.columns_per_packet != self._metadata.columns_per_frame:
-            return None
-        return self._headers.table(self._frame_ids, self._rank, self._packets_per_frame)
-
-    def sent_by_me(self, packets: U8Array) -> BoolArray:
-        """(P,) whether packets carry this sensor's serial number, or none."""
-        return self._headers.sent_by_me(packets)
-
-    def faults(self, packets: U8Array) -> U8Array:
-        """(P,) index into FAULTS."""
-        return self._headers.faults(packets)
-
-    def sequence(self, packets: U8Array) -> I64Array:
-        """(P,) frame id and rank within the frame as one number."""
-        frame = self._headers.frame_ids(packets) % self._frame_ids
-        first = first_measurement_ids(packets, self._metadata.layout)
-        block = first // self.columns_per_packet
-        rank = self._rank.take(block, mode="clip")
-        inside = frame * self._packets_per_frame + rank
-        is_inside = (rank >= 0) & (block < len(self._rank))
-        if is_inside.all():
-            return inside
-        return np.where(is_inside, inside, -1 - (frame * len(self._rank) + block))
-
-    def column_headers(self, packets: U8Array, host_ns: I64Array) -> ColumnHeaders:
-        """Timestamps, measurement ids and validity of all columns."""
-        return self._headers.column_headers(packets)
+    def header_bytes(self) -> I64Array:
+        """Headers of packet and columns."""
+        return self._header_bytes
 
     def is_imu(self, size: int) -> bool:
         """Whether a payload of this size is an IMU packet; old ROS drivers append one byte."""
@@ -277,10 +258,6 @@ class OusterLidar:
         """Pose of the IMU in the sensor frame, metres."""
         pose: F64Array = self._metadata.imu_to_sensor.copy()
         return pose
-
-    def projection(self, body_from_sensor: F64Array) -> Projection | None:
-        """None: the beam vectors suffice."""
-        return None
 
 
 def beam_table(described: Metadata) -> BeamTable:
@@ -311,12 +288,12 @@ def beam_table(described: Metadata) -> BeamTable:
     )
 
 
-def _headers(described: Metadata, check_crc: bool) -> Headers:
+def _headers(described: Metadata) -> Headers:
     layout = described.layout
     columns = described.columns_per_frame
     if layout.legacy:
         return LegacyHeaders(layout, columns)
-    return PacketHeaders(layout, columns, described.header, described.serial, check_crc)
+    return PacketHeaders(layout, columns, described.header, described.serial)
 
 
 def _column_period_ns(described: Metadata) -> float:

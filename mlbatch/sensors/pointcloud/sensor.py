@@ -14,17 +14,15 @@ from pathlib import Path
 
 import numpy as np
 
-from mlbatch.arrays import F64Array, I64Array, U8Array
+from mlbatch.arrays import F64Array, U8Array
 from mlbatch.errors import RigError
-from mlbatch.lidar.content_keys import hash_factors
-from mlbatch.lidar.geometry import BeamTable, rotor_words
-from mlbatch.lidar.header_table import SingleColumns
-from mlbatch.lidar.interface import FAULTS, Calibration, Evidence, Lidar, Records, SensorModel
+from mlbatch.lidar.geometry import BeamTable
+from mlbatch.lidar.headers import EvenColumns, HeaderReader, check_of, checks
+from mlbatch.lidar.interface import Calibration, Evidence, Lidar, Records, SensorModel
 from mlbatch.lidar.projections import PlacedPoints
 from mlbatch.ros.point_packets import HEAD, KINDS, MAGIC, MOST_SLOTS, REALS, VERSION, Layout
 from mlbatch.sensors.base import BaseLidar
 from mlbatch.sensors.options import check_options
-from mlbatch.types import ColumnHeaders
 
 VENDOR = "any"
 # In the order of KINDS.
@@ -41,7 +39,6 @@ MODELS: tuple[SensorModel, ...] = tuple(
     for name, vendor in zip(KINDS, (VENDOR, "Livox"), strict=True)
 )
 _FITS = 100
-_BAD_HEADER = FAULTS.index("bad_header")
 # Magic, version, kind and slots: the same in all packets of a topic.
 _SHARED_BYTES = 8
 _STAMP_AT = 8
@@ -137,37 +134,21 @@ class CloudLidar(BaseLidar):
         nowhere = np.zeros((3, slots, 3))
         self.beams = BeamTable(nowhere, nowhere[:, :1], np.zeros(1))
         self.calibration = "none"
-        self._shared = layout.begin.view(np.uint8)[:_SHARED_BYTES].view("<u8")[0]
-        self._reals = slice(HEAD.itemsize, HEAD.itemsize + 4 * REALS * slots)
-        # In columns of one point, rotor words differ.
-        if slots > 1:
-            self.headers = SingleColumns(
-                layout.size,
-                int(self._shared.view("<i8")),
-                _STAMP_AT,
-                hash_factors(layout.size // 8),
-            )
-
-    def faults(self, packets: U8Array) -> U8Array:
-        """`bad_header` for packets of another layout."""
-        head = np.ascontiguousarray(packets[:, :_SHARED_BYTES]).view("<u8")[:, 0]
-        faults = np.zeros(len(packets), np.uint8)
-        faults[head != self._shared] = _BAD_HEADER
-        return faults
-
-    def column_headers(self, packets: U8Array, host_ns: I64Array) -> ColumnHeaders:
-        """Timestamp of every column, shared by its points."""
-        head = np.ascontiguousarray(packets[:, : HEAD.itemsize]).view(HEAD)
-        stamp_ns: I64Array = head["stamp_ns"].astype(np.int64)
-        still = np.zeros(stamp_ns.shape)
-        ring: I64Array | int = 0
-        if self.channels == 1:
-            at = HEAD.itemsize + 4 * REALS
-            ring = (
-                np.ascontiguousarray(packets[:, at : at + 2]).view("<u2").astype(np.int64) % _RINGS
-            )
-        return ColumnHeaders(
-            stamp_ns, rotor_words(still, still, ring), np.ones(stamp_ns.shape, np.bool_)
+        shared = layout.begin.view(np.uint8)[:_SHARED_BYTES].tobytes()
+        self.reader = HeaderReader(
+            EvenColumns(
+                packet_bytes=layout.size,
+                columns=1,
+                check_count=1,
+                checks=checks(check_of(0, shared)),
+                stamp_at=_STAMP_AT,
+                interval_at=-1,
+                interval_ns=0,
+                counter_at=-1,
+                ring_at=HEAD.itemsize + 4 * REALS if slots == 1 else -1,
+                rings=_RINGS,
+            ),
+            has_number=False,
         )
 
     def projection(self, body_from_sensor: F64Array) -> PlacedPoints:

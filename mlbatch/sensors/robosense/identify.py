@@ -23,11 +23,10 @@ from mlbatch.sensors.packet_bytes import (
     payload_rows,
 )
 from mlbatch.sensors.robosense import models as rows
-from mlbatch.sensors.robosense.models import SECOND_KIND, VENDOR, Layout, Model
+from mlbatch.sensors.robosense.models import DIFOP, SECOND_KIND, VENDOR, Layout, Model
 from mlbatch.sensors.robosense.packets import in_time_form
 
 _SOLID_STATE = bytes.fromhex("55aa5aa5")
-DIFOP = bytes.fromhex("a5ff005a11115555")
 _IMU = bytes.fromhex("aa555a05")
 _IMU_SIZE = 51
 # Bytes of type and model, which sources place differently (section 2).

@@ -64,6 +64,8 @@ _RUBY_PLUS_48_NS = _each(_RUBY_PLUS_LONG, 2)
 VENDOR = "ROBOSENSE"
 FIRST_KIND = bytes.fromhex("55aa050a5aa550a0")
 SECOND_KIND = bytes.fromhex("55aa055a")
+# First bytes of a device packet.
+DIFOP = bytes.fromhex("a5ff005a11115555")
 # Numbers of return types, docs/sources/outputs.md section 3; the nearest return has none of its
 # own.
 STRONGEST = 1

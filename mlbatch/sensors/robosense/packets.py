@@ -10,19 +10,17 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from mlbatch.arrays import BoolArray, F64Array, I64Array, U8Array, median
-from mlbatch.lidar.geometry import rotor_words
-from mlbatch.lidar.interface import FAULTS, Records
+from mlbatch.arrays import BoolArray, I64Array, U8Array, median
+from mlbatch.lidar.headers import TimedRows, check_of, checks
+from mlbatch.lidar.interface import Records
 from mlbatch.lidar.pixel_table import PixelTable, readings
-from mlbatch.sensors.packet_bytes import has_bytes, majority, number
-from mlbatch.sensors.robosense.models import READING, Layout, Model
-from mlbatch.types import ColumnHeaders
+from mlbatch.sensors.packet_bytes import majority, number
+from mlbatch.sensors.robosense.models import DIFOP, READING, Model
 from mlbatch.units import NS_PER_S, NS_PER_US
 
 _CDEG_PER_REVOLUTION = 36000
 # An azimuth step above 1 degree is a gap in the field of view.
 _GAP_CDEG = 100
-_BAD_HEADER = FAULTS.index("bad_header")
 _YEAR_2000_MONTHS = 30 * 12
 # Lengths of months are not checked: days 29 to 31 may run into the next month.
 _CALENDAR_LIMITS = ((1, 12), (1, 31), (0, 23), (0, 59), (0, 60))
@@ -112,113 +110,96 @@ def in_time_form(packets: U8Array, model: Model) -> Model:
     return other if other_form and not own_form else model
 
 
-class PacketReader:
-    """Decoder of point packets of one model in one return mode; see `Lidar`."""
+def header_table(
+    model: Model,
+    shape: Shape,
+    size: int,
+    cdeg_per_s: float,
+    *,
+    is_counted: bool,
+    mirrored: bool,
+    moving: bool,
+) -> TimedRows:
+    """Layout of the headers of packets of a size.
 
-    def __init__(
-        self, model: Model, shape: Shape, units_per_m: int, *, mirrored: bool, moving: bool
-    ) -> None:
-        """mirrored: azimuths count backwards; moving: apply rotor motion during a round."""
-        self._model = model
-        self._shape = shape
-        self._units_per_m = np.float32(units_per_m)
-        self._sense = -1.0 if mirrored else 1.0
-        self._moving = moving
-        self._row_ns = model.round_ns * shape.columns
-        self._cdeg_per_s = 0.0
+    cdeg_per_s: mean rotor speed, used across gaps; is_counted: packets have a counter; mirrored:
+    azimuths count backwards; moving: apply rotor motion during a round.
+    """
+    layout = model.layout
+    start_ns = np.arange(shape.columns) * model.round_ns + min(model.firing_ns[0])
+    turns = (-1.0 if mirrored else 1.0) / _CDEG_PER_REVOLUTION
+    fixed = (check_of(0, layout.magic), check_of(layout.header, layout.block_id))
+    return TimedRows(
+        packet_bytes=size,
+        columns=shape.columns,
+        rows=shape.rows,
+        first_row=layout.header,
+        row_bytes=layout.stride * shape.row_blocks,
+        check_count=len(fixed),
+        checks=checks(*fixed),
+        foreign_count=1,
+        foreign=checks(check_of(0, DIFOP)),
+        point_at=layout.point_at or -1,
+        row_id=int.from_bytes(layout.block_id, "little"),
+        row_id_bytes=len(layout.block_id),
+        circle=_CDEG_PER_REVOLUTION,
+        widest=_GAP_CDEG,
+        time_at=layout.time_at,
+        is_calendar=model.is_calendar,
+        counter_at=model.counter_at if is_counted else -1,
+        repeats=shape.is_split,
+        row_ns=model.round_ns * shape.columns,
+        start_ns=start_ns,
+        start_s=start_ns / NS_PER_S,
+        known_speed=cdeg_per_s,
+        turns=turns,
+        following=turns * moving,
+    )
 
-    def learn_speed(self, packets: U8Array) -> None:
-        """Measure the mean rotor speed from a sample of packets; used across gaps."""
-        stamp_ns, _ = times_ns(packets, self._model)
-        azimuth, good = self._azimuths(packets)
-        took_ns = np.diff(stamp_ns)
-        rotated = _signed(np.diff(azimuth[:, 0]))
-        near = (took_ns > 0) & (took_ns < _NEIGHBOURS_NS) & good[1:, 0] & good[:-1, 0]
-        if near.any():
-            self._cdeg_per_s = float(rotated[near].sum() / took_ns[near].sum() * NS_PER_S)
-        else:
-            self._cdeg_per_s = median(self._steps(azimuth, good)[0])
 
-    def faults(self, packets: U8Array) -> U8Array:
-        """(P,) index into FAULTS."""
-        layout = self._model.layout
-        good = has_bytes(packets, layout.magic) & has_bytes(packets, layout.block_id, layout.header)
-        good &= times_ns(packets, self._model)[1]
-        return np.where(good, 0, _BAD_HEADER).astype(np.uint8)
+def mean_speed(packets: U8Array, model: Model, shape: Shape) -> float:
+    """Mean rotor speed of a sample of packets, 0.01 degree/s; 0: unknown."""
+    if not len(packets):
+        return 0.0
+    stamp_ns, _ = times_ns(packets, model)
+    azimuth, good = _azimuths(packets, model, shape)
+    took_ns = np.diff(stamp_ns)
+    rotated = _signed(np.diff(azimuth[:, 0]))
+    near = (took_ns > 0) & (took_ns < _NEIGHBOURS_NS) & good[1:, 0] & good[:-1, 0]
+    if near.any():
+        return float(rotated[near].sum() / took_ns[near].sum() * NS_PER_S)
+    step = _signed(np.diff(azimuth, axis=1))
+    plain = good[:, 1:] & good[:, :-1] & (np.abs(step) <= _GAP_CDEG)
+    plain &= (step != 0) | (not shape.is_split)
+    count = plain.sum(axis=1)
+    row_ns = model.round_ns * shape.columns
+    own = np.where(plain, step, 0).sum(axis=1) * (NS_PER_S / row_ns) / np.maximum(count, 1)
+    return median(own)
 
-    def column_headers(self, packets: U8Array) -> ColumnHeaders:
-        """Timestamps, rotor words and validity of all columns."""
-        model = self._model
-        shape = self._shape
-        stamp_ns, _ = times_ns(packets, model)
-        azimuth, good = self._azimuths(packets)
-        speed, row_ns = self._steps(azimuth, good)
-        round_ns = np.arange(shape.columns) * model.round_ns + min(model.firing_ns[0])
-        # Written out, since -1 cannot be inferred without packets.
-        flat = len(packets), row_ns.shape[1] * shape.columns
-        after_ns = (row_ns[:, :, None] + round_ns).reshape(flat)
-        at_round = azimuth[:, :, None] + speed[:, None, None] * (round_ns / NS_PER_S)
-        revolutions = self._sense / _CDEG_PER_REVOLUTION * at_round.reshape(flat)
-        revolutions_per_s = (self._sense / _CDEG_PER_REVOLUTION * self._moving) * speed
-        words = rotor_words(revolutions, revolutions_per_s[:, None])
-        valid = np.repeat(good, shape.columns, axis=1)
-        return ColumnHeaders(stamp_ns[:, None] + after_ns, words, valid)
 
-    def pixels(self) -> PixelTable:
-        """Pixel layout for compiled decoding."""
-        model = self._model
-        shape = self._shape
-        firsts = tuple(
-            tuple(
-                which * shape.return_step + part * model.layout.stride
-                for part in range(model.blocks_per_round)
-            )
-            for which in range(shape.returns)
+def pixels(model: Model, shape: Shape, units_per_m: int) -> PixelTable:
+    """Pixel layout for compiled decoding."""
+    firsts = tuple(
+        tuple(
+            which * shape.return_step + part * model.layout.stride
+            for part in range(model.blocks_per_round)
         )
-        returns = readings(firsts, model.channels, ">u2", model.range_mask)
-        return PixelTable(READING, returns, float(self._units_per_m))
-
-    def _azimuths(self, packets: U8Array) -> tuple[I64Array, BoolArray]:
-        """Azimuths of the rows (P, rows), 0.01 degree, and whether the rows are valid."""
-        layout = self._model.layout
-        shape = self._shape
-        at = layout.header + layout.stride * shape.row_blocks * np.arange(shape.rows)
-        azimuth = packets[:, at + 2].astype(np.int64) << 8 | packets[:, at + 3]
-        # Sensors round the last angles of a revolution up to 360 degrees.
-        good = (azimuth <= _CDEG_PER_REVOLUTION) & _has_ids(packets, at, layout)
-        return azimuth % _CDEG_PER_REVOLUTION, good
-
-    def _steps(self, azimuth: I64Array, good: BoolArray) -> tuple[F64Array, I64Array]:
-        """Speed (P,) of the rotor, 0.01 degree/s, and begin (P, rows) of the rows, ns.
-
-        The speed of a packet follows from its steps from row to row. The duration of a gap in the
-        field of view follows from its angle; a packet has at most one, else an azimuth is damaged.
-        """
-        step = _signed(np.diff(azimuth, axis=1))
-        sure = good[:, 1:] & good[:, :-1]
-        again = sure & (step == 0) if self._shape.is_split else np.zeros_like(sure)
-        gap = sure & (np.abs(step) > _GAP_CDEG)
-        plain = sure & ~gap & ~again
-        count = plain.sum(axis=1)
-        rotated = np.where(plain, step, 0).sum(axis=1)
-        own = rotated * (NS_PER_S / self._row_ns) / np.maximum(count, 1)
-        wait_ns = np.where(again, 0, self._row_ns)
-        if gap.any() and self._cdeg_per_s:
-            gap &= gap.sum(axis=1, keepdims=True) == 1
-            forward = np.where(self._cdeg_per_s > 0, step, -step) % _CDEG_PER_REVOLUTION
-            bridge_ns = np.rint(forward * (NS_PER_S / abs(self._cdeg_per_s))).astype(np.int64)
-            wait_ns = np.where(gap, bridge_ns, wait_ns)
-        begin_ns = np.zeros(azimuth.shape, np.int64)
-        np.cumsum(wait_ns, axis=1, out=begin_ns[:, 1:])
-        return np.where(count > 0, own, self._cdeg_per_s), begin_ns
+        for which in range(shape.returns)
+    )
+    returns = readings(firsts, model.channels, ">u2", model.range_mask)
+    return PixelTable(READING, returns, float(np.float32(units_per_m)))
 
 
-def _has_ids(packets: U8Array, at: I64Array, layout: Layout) -> BoolArray:
-    """(P, rows) whether the rows at these bytes begin with the id of a block."""
-    good = np.ones((len(packets), len(at)), np.bool_)
+def _azimuths(packets: U8Array, model: Model, shape: Shape) -> tuple[I64Array, BoolArray]:
+    """Azimuths of the rows (P, rows), 0.01 degree, and whether the rows are valid."""
+    layout = model.layout
+    at = layout.header + layout.stride * shape.row_blocks * np.arange(shape.rows)
+    azimuth = packets[:, at + 2].astype(np.int64) << 8 | packets[:, at + 3]
+    # Sensors round the last angles of a revolution up to 360 degrees.
+    good = azimuth <= _CDEG_PER_REVOLUTION
     for place, byte in enumerate(layout.block_id):
         good &= packets[:, at + place] == byte
-    return good
+    return azimuth % _CDEG_PER_REVOLUTION, good
 
 
 def _signed(step: I64Array) -> I64Array:

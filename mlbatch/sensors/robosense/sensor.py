@@ -14,14 +14,15 @@ from typing import NoReturn
 
 import numpy as np
 
-from mlbatch.arrays import BoolArray, I64Array, U8Array
+from mlbatch.arrays import U8Array
 from mlbatch.errors import RigError
 from mlbatch.lidar.geometry import BeamTable, spherical
+from mlbatch.lidar.headers import HeaderReader
 from mlbatch.lidar.interface import NAMED_ONLY, Calibration, Evidence, SensorModel
 from mlbatch.sensors.base import BaseLidar
 from mlbatch.sensors.nominal import refuse_other_beams
 from mlbatch.sensors.options import check_options
-from mlbatch.sensors.packet_bytes import majority, number
+from mlbatch.sensors.packet_bytes import majority
 from mlbatch.sensors.robosense.difop import (
     COUNTER_MODULUS,
     RANGE_UNIT,
@@ -41,12 +42,17 @@ from mlbatch.sensors.robosense.identify import (
     Identity,
     describe,
     fits,
-    is_difop,
     point_packets,
 )
 from mlbatch.sensors.robosense.models import FIRST_LAYOUT, ROWS, VENDOR, Model
-from mlbatch.sensors.robosense.packets import PacketReader, in_time_form, shape_of, times_ns
-from mlbatch.types import ColumnHeaders
+from mlbatch.sensors.robosense.packets import (
+    header_table,
+    in_time_form,
+    mean_speed,
+    pixels,
+    shape_of,
+    times_ns,
+)
 from mlbatch.units import RAD_PER_DEG
 
 __all__ = ["BUILT_IN", "MODELS", "VENDOR", "RobosenseLidar", "describe", "read_calibration"]
@@ -257,34 +263,22 @@ class RobosenseLidar(BaseLidar):
         self.notes = (*time_notes, *mode_notes, *unit_notes, *doubtful)
         self._row = row
         moving = options.get("firing_azimuth") != "off"
-        self._packets = PacketReader(timed, shape, steps_per_m, mirrored=mirrored, moving=moving)
-        self._packets.learn_speed(points)
-        self.pixels = self._packets.pixels()
+        table = header_table(
+            timed,
+            shape,
+            self.packet_size,
+            mean_speed(points, timed, shape),
+            is_counted=bool(self.sequence_modulus),
+            mirrored=mirrored,
+            moving=moving,
+        )
+        self.reader = HeaderReader(table, has_number=bool(self.sequence_modulus))
+        self.pixels = pixels(timed, shape, steps_per_m)
 
     @property
     def columns_per_s(self) -> float:
         """Columns sent in a second: one a round, or one for each of its returns."""
         return self._columns_per_round * super().columns_per_s
-
-    def sent_by_me(self, packets: U8Array) -> BoolArray:
-        """(P,) True for point packets, False for device packets on the same topic."""
-        own = ~is_difop(packets)
-        at = self._row.layout.point_at
-        return own & (packets[:, at] == 0) if at else own
-
-    def faults(self, packets: U8Array) -> U8Array:
-        """(P,) index into FAULTS."""
-        return self._packets.faults(packets)
-
-    def sequence(self, packets: U8Array) -> I64Array:
-        """(P,) packet counter; without one, a hash of the content."""
-        if not self.sequence_modulus:
-            return super().sequence(packets)
-        return number(packets, self._row.counter_at, 4, ">")
-
-    def column_headers(self, packets: U8Array, host_ns: I64Array) -> ColumnHeaders:
-        """Timestamps, rotor words and validity of all columns."""
-        return self._packets.column_headers(packets)
 
 
 def _timed(points: U8Array, row: Model) -> tuple[Model, tuple[str, ...]]:

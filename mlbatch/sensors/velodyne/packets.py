@@ -11,15 +11,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from mlbatch.arrays import BoolArray, F64Array, I64Array, U8Array
-from mlbatch.lidar.content_keys import hash_factors
-from mlbatch.lidar.geometry import rotor_words
-from mlbatch.lidar.header_table import PacedBlocks
-from mlbatch.lidar.interface import FAULTS
+from mlbatch.lidar.headers import HeaderReader, PacedBlocks
 from mlbatch.lidar.pixel_table import PixelTable, readings
 from mlbatch.lidar.projections import CorrectedRanges
 from mlbatch.sensors.base import BaseLidar
 from mlbatch.sensors.velodyne.calibration import VelodyneFile
-from mlbatch.sensors.velodyne.clock import HOUR_NS, absolute_ns, top_of_hour_ns
+from mlbatch.sensors.velodyne.clock import HOUR_NS, top_of_hour_ns
 from mlbatch.sensors.velodyne.hdl64 import hdl64_projection
 from mlbatch.sensors.velodyne.models import (
     CIRCLE_CDEG,
@@ -36,12 +33,10 @@ from mlbatch.sensors.velodyne.models import (
     layout,
     ranks,
 )
-from mlbatch.types import ColumnHeaders
 from mlbatch.units import NS_PER_S
 
 VENDOR = "Velodyne"
 _AZIMUTH_AT = 2
-_BAD_HEADER = FAULTS.index("bad_header")
 _RETURN_TYPES = {"strongest return": (1,), "last return": (2,), DUAL: (0, 0)}
 # Section 4: an azimuth step wider than others by this factor is a blind sector.
 _GAP_FACTOR = 3
@@ -125,31 +120,7 @@ class VelodyneLidar(BaseLidar):
         self.timestamp_mode = measured.timestamp_mode
         self.clock_period_ns = HOUR_NS
         self.notes = notes
-        self._start_ns, self._ahead_ns = self._timetable()
-        self.headers = self._header_table()
-
-    def faults(self, packets: U8Array) -> U8Array:
-        """(P,) index into FAULTS."""
-        good = are_good(packets, self._model, self.returns)
-        return np.where(good, 0, _BAD_HEADER).astype(np.uint8)
-
-    def column_headers(self, packets: U8Array, host_ns: I64Array) -> ColumnHeaders:
-        """Timestamps and rotor words of all columns; all are valid."""
-        azimuth = first_azimuths(packets, self._layout)
-        speed, delay_ns = self._motion(azimuth)
-        toh_ns = top_of_hour_ns(packets)
-        packet_ns = absolute_ns(toh_ns, host_ns + self._measured.clock_offset_ns)
-        halves = self._model.halves
-        shape = (len(packets), self._layout.columns)
-        stamp_ns = packet_ns[:, None] + delay_ns.repeat(halves, axis=1) + self._start_ns
-        revolutions = (
-            azimuth.repeat(halves, axis=1) + speed[:, None] * self._ahead_ns
-        ) / CIRCLE_CDEG
-        rotor_speed = speed if self._options.firing_azimuth else np.zeros_like(speed)
-        revolutions_per_s = (rotor_speed * (NS_PER_S / CIRCLE_CDEG))[:, None]
-        return ColumnHeaders(
-            stamp_ns, rotor_words(revolutions, revolutions_per_s), np.ones(shape, np.bool_)
-        )
+        self.reader = HeaderReader(self._header_table(), has_number=False)
 
     def projection(self, body_from_sensor: F64Array) -> CorrectedRanges | None:
         """Projection of the HDL-64E, whose corrections depend on the range; else None."""
@@ -161,27 +132,35 @@ class VelodyneLidar(BaseLidar):
         return hdl64_projection(file, body_from_sensor)
 
     def _header_table(self) -> PacedBlocks:
-        """Layout of the headers for compiled loops."""
+        """Layout of the headers."""
         model = self._model
         measured = self._measured
+        start_ns, ahead_ns = self._timetable()
+        flags = expected_flags(model.banks, self.returns)
+        modes = _MAY_BE_MODE[self.returns].astype(np.uint8)
         return PacedBlocks(
             packet_bytes=PACKET_SIZE,
             columns=self._layout.columns,
             groups=self._layout.sequences,
+            blocks_per_group=self._layout.blocks,
+            block_count=len(flags),
             block_bytes=STRIDE,
-            flags=expected_flags(model.banks, self.returns),
-            hash_factors=hash_factors(PACKET_SIZE // 8),
+            flags=flags.astype(np.int64),
             circle=CIRCLE_CDEG,
             widest=_GAP_CDEG,
+            gap_factor=_GAP_FACTOR,
             stamp_at=STAMP_AT,
             period_ns=HOUR_NS,
             clock_offset_ns=measured.clock_offset_ns,
+            # Other models differ by flags; the HDL-64E has its status there.
             mode_at=MODE_AT,
-            modes=_MAY_BE_MODE[self.returns] if model.banks == 1 else None,
-            start_ns=self._start_ns,
-            ahead_ns=self._ahead_ns,
+            modes=modes if model.banks == 1 else None,
+            start_ns=start_ns,
+            ahead_ns=ahead_ns,
             group_ns=measured.sequence_ns * model.halves,
             known_speed=measured.speed,
+            slowest=_SLOWEST,
+            tolerance=_SPEED_TOLERANCE,
             follows_rotor=self._options.firing_azimuth,
         )
 
@@ -195,28 +174,6 @@ class VelodyneLidar(BaseLidar):
             start_ns -= start_ns[-1] + self.firing_ns.max()
         ahead_ns: F64Array = (number % model.halves).astype(np.float64) * sequence_ns
         return start_ns, ahead_ns
-
-    def _motion(self, azimuth: I64Array) -> tuple[F64Array, I64Array]:
-        """(P,) rotor speed, and (P, sequences) delay of columns after blind sectors."""
-        known = self._measured.speed
-        if azimuth.shape[1] < 2:
-            return np.full(len(azimuth), known), np.zeros(azimuth.shape, np.int64)
-        step, gap = steps(azimuth)
-        group_ns = self._measured.sequence_ns * self._model.halves
-        speed = mean_step(step, gap) / group_ns
-        delay_ns = np.zeros(azimuth.shape, np.int64)
-        some: BoolArray = np.logical_or.reduce(gap, axis=1)
-        rows = some.nonzero()[0]
-        if len(rows):
-            own = speed[rows]
-            # Across half a revolution, the speed over many packets is better than over a few
-            # blocks.
-            steady = np.where(np.abs(own - known) < _SPEED_TOLERANCE * known, known, own)
-            is_blind = gap[rows] & (steady > _SLOWEST)[:, None]
-            blind_ns = step[rows] / np.maximum(steady, _SLOWEST)[:, None] - group_ns
-            late_ns = np.where(is_blind, blind_ns, 0).cumsum(axis=1)
-            delay_ns[rows, 1:] = np.rint(late_ns).astype(np.int64)
-        return speed, delay_ns
 
 
 def are_good(packets: U8Array, model: Model, returns: int) -> BoolArray:

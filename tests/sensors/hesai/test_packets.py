@@ -9,15 +9,54 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mlbatch.sensors.hesai.packets import packet_times
+from mlbatch.lidar.headers import DatedGroups, HeaderReader, checks
 from tests.builders.hesai import date_field
 from tests.builders.hesai_models import EPOCH, SINCE_1900
+
+# One block of two bytes, then date and microseconds.
+_READER = HeaderReader(
+    DatedGroups(
+        packet_bytes=12,
+        columns=1,
+        returns=1,
+        first_block=0,
+        block_bytes=2,
+        azimuth_at=0,
+        azimuth_bytes=2,
+        circle=1 << 16,
+        check_count=0,
+        checks=checks(),
+        has_flags=False,
+        mode_at=-1,
+        modes=None,
+        date_at=2,
+        us_at=8,
+        sequence_at=-1,
+        sequence_bytes=0,
+        operation_at=-1,
+        operations=1,
+        loop_at=-1,
+        states_at=-1,
+        state_count=1,
+        tables=np.zeros((1, 1), np.int64),
+        first_ns=np.zeros(1, np.int64),
+        base_ns=0,
+        step_ns=np.zeros(1, np.int64),
+        divisor=1,
+        counts_back=False,
+        azimuth_ns=0,
+        rpm_at=-1,
+        rpm_is_signed=False,
+        turns_per_s=0.0,
+    ),
+    has_number=False,
+)
 
 
 def _read(date: bytes, us: int = 0) -> tuple[int, bool]:
     packet = np.frombuffer(b"\xff\xff" + date + struct.pack("<I", us), np.uint8)
-    times_ns, valid = packet_times(np.stack([packet] * 2), 2, 8)
-    return int(times_ns[1]), bool(valid[1])
+    found = _READER.read_rows(np.stack([packet] * 2))
+    return int(found.columns.stamp_ns[1, 0]), not found.faults[1]
 
 
 @pytest.mark.parametrize(
