@@ -805,6 +805,26 @@ def test_a_kill_after_the_last_rename_leaves_nothing_to_do(
     assert not Path("out/files.jsonl").exists()
 
 
+def test_a_kill_between_the_renames_of_a_replaced_folder_is_resumed(
+    shell: Shell, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The older output has another name then, and the new one none yet."""
+    whole = _whole(shell)
+    assert shell(f"convert {CAPTURE} -o out --rate 5").code == 0
+
+    def ending(output: atomic.Output) -> None:
+        output.target.rename(atomic.old_path(output.target))
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(atomic.Output, "_replace_folder", ending)
+        assert shell(f"convert {CAPTURE} -o out --overwrite").code == 130
+    assert sorted(path.name for path in Path().glob("out*")) == ["out.old.partial", "out.partial"]
+    outcome = shell(f"convert {CAPTURE} -o out --overwrite --resume")
+    assert outcome.err == f"mlbatch: out: resumed after {SCANS} scans\n"
+    assert contents(Path()) == whole
+
+
 def test_a_dry_run_leaves_nothing_to_resume(shell: Shell) -> None:
     outcome = shell(f"convert {CAPTURE} --dry-run --resume")
     assert outcome.code == 2
