@@ -7,13 +7,13 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple, TypeAlias
 
 import numpy as np
+from isal.isal_zlib import crc32
 
 from mlbatch.arrays import I64Array
 from mlbatch.batching.windows import Window
 from mlbatch.decode.decoder import Decoder, ScanHeader, Source
 from mlbatch.report.ledger import PointCounts
 from mlbatch.types import NO_COLUMNS, ColumnFigures, Scan, WindowColumns
-from mlbatch.writers.output_file import crc32
 from mlbatch.writers.point_layouts import clipped_points
 
 # Counts of the points of a scan, one list a sensor, in the order of `ledger.POINT_COUNTERS`.

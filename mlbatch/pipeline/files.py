@@ -22,6 +22,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple, TypeAlias, TypeVar
 
 import numpy as np
+from isal.isal_zlib import crc32
 
 from mlbatch.bounded import parse_json
 from mlbatch.errors import ExportError, UsageError
@@ -40,7 +41,7 @@ from mlbatch.writers import (
     partial_path,
 )
 from mlbatch.writers.base import windows_per_file
-from mlbatch.writers.output_file import crc32, file_crc, write_all
+from mlbatch.writers.output_file import file_crc, write_all
 
 if TYPE_CHECKING:
     from mlbatch.pipeline.conversion import Conversion

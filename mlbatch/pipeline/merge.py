@@ -17,6 +17,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from isal.isal_zlib import crc32
+
 from mlbatch.errors import ExportError, RecordingError, UsageError
 from mlbatch.pipeline.files import records
 from mlbatch.pipeline.job_identity import difference
@@ -43,7 +45,7 @@ from mlbatch.writers import (
     write_text,
 )
 from mlbatch.writers.bag_writer import name_of_file, number_of_file, write_metadata
-from mlbatch.writers.output_file import crc32, file_crc
+from mlbatch.writers.output_file import file_crc
 
 _KB_PER_MB = 1024
 _AGAIN = "copy the part again, or convert this shard again with --overwrite"

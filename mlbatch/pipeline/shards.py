@@ -15,6 +15,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from isal.isal_zlib import crc32
+
 import mlbatch
 from mlbatch.bounded import parse_json, read_text
 from mlbatch.errors import RecordingError, UsageError
@@ -33,7 +35,7 @@ from mlbatch.writers import (
     write_text,
 )
 from mlbatch.writers.bag_metadata import METADATA
-from mlbatch.writers.output_file import crc32, file_crc
+from mlbatch.writers.output_file import file_crc
 
 SCHEMA = "mlbatch.shard/4"
 

@@ -14,6 +14,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TypeAlias
 
+from isal.isal_zlib import crc32
 from mcap.data_stream import RecordBuilder
 from mcap.opcode import Opcode
 from mcap.records import (
@@ -39,7 +40,7 @@ from mlbatch.ros.definitions import definition, is_known, qos, qos_in_numbers
 from mlbatch.types import Message, Summary, Topic
 from mlbatch.writers.atomic import SCANS_CSV
 from mlbatch.writers.base import NO_COMPRESSION
-from mlbatch.writers.output_file import Bytes, OutputFile, borrow, crc32, joined_crc
+from mlbatch.writers.output_file import Bytes, OutputFile, borrow, joined_crc
 
 # Compresses so many bytes, given in parts, to one frame.
 Compress: TypeAlias = Callable[[Sequence[Bytes], int], list[Bytes]]

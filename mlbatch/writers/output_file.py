@@ -3,20 +3,18 @@
 from __future__ import annotations
 
 import contextlib
-import importlib
 import io
 import os
-import zlib
 from collections import deque
 from collections.abc import Callable, Sequence
-from functools import lru_cache
 from pathlib import Path
-from typing import TypeAlias, TypeVar, cast
+from typing import TypeAlias, TypeVar
+
+from isal.isal_zlib import crc32, crc32_combine
 
 from mlbatch.writers.direct_writes import DirectWrites
 
 Bytes: TypeAlias = bytes | bytearray | memoryview  # views have items of one byte
-Checksum: TypeAlias = Callable[[Bytes, int], int]
 Scratch = TypeVar("Scratch")
 
 # POSIX guarantees 16 buffers a write; all current systems take 1024.
@@ -36,51 +34,14 @@ def borrow(idle: list[Scratch], new: Callable[[], Scratch]) -> Scratch:
         return new()
 
 
-def _best_checksum() -> Checksum:
-    """Return CRC-32 as in zlib from the fastest installed library."""
-    with contextlib.suppress(ImportError):
-        return cast(Checksum, importlib.import_module("isal.isal_zlib").crc32)
-    return zlib.crc32
-
-
-crc32 = _best_checksum()
-# x^32 + x^26 + ... + 1 without the first term, and x^1; the highest bit is the term of x^0.
-_POLYNOMIAL = 0xEDB88320
-_X = 1 << 30
-_ONE = 1 << 31
 # A piece stays in the cache of a core between its checksum and its copy to the system.
 _PIECE_BYTES = 1 << 18
 
 
 def joined_crc(first: int, second: int, size: int) -> int:
-    """Return the CRC-32 of bytes and `size` more bytes, from those of both.
-
-    A byte multiplies what precedes it by x^8, as in `crc32_combine` of zlib.
-    """
-    return _product(_shift(size), first) ^ second
-
-
-@lru_cache(maxsize=256)
-def _shift(size: int) -> int:
-    """Return x^(8 size) modulo the polynomial."""
-    power, square = _ONE, _X
-    exponent = 8 * size
-    while exponent:
-        if exponent & 1:
-            power = _product(power, square)
-        square = _product(square, square)
-        exponent >>= 1
-    return power
-
-
-def _product(one: int, other: int) -> int:
-    """Return the product of two polynomials modulo the polynomial of CRC-32."""
-    product = 0
-    for bit in range(31, -1, -1):
-        if one >> bit & 1:
-            product ^= other
-        other = other >> 1 ^ (_POLYNOMIAL if other & 1 else 0)
-    return product
+    """Return the CRC-32 of bytes and `size` more bytes, from those of both."""
+    joined: int = crc32_combine(first, second, size)
+    return joined
 
 
 def file_crc(path: Path) -> int:

@@ -13,7 +13,6 @@ from mlbatch.writers.output_file import (
     Bytes,
     WriteBehind,
     borrow,
-    crc32,
     file_crc,
     joined_crc,
     write_all,
@@ -47,11 +46,6 @@ def test_a_joined_checksum_is_that_of_all_bytes(first: bytes, size: int, value: 
     second = bytes([value]) * size
     joined = joined_crc(zlib.crc32(first), zlib.crc32(second), size)
     assert joined == zlib.crc32(first + second)
-
-
-def test_checksums_are_those_of_zlib() -> None:
-    data = bytes(range(256)) * 9
-    assert crc32(data[100:], crc32(data[:100], 0)) == zlib.crc32(data)
 
 
 def test_scratch_is_reused() -> None:

@@ -15,11 +15,12 @@ from typing import TypeAlias
 
 import numpy as np
 import numpy.typing as npt
+from isal.isal_zlib import crc32
 
 from mlbatch.errors import ExportError
 from mlbatch.types import EXTRAS, RunInfo, Scan
 from mlbatch.writers.base import ScanWriter, WriterOptions
-from mlbatch.writers.output_file import Bytes, crc32
+from mlbatch.writers.output_file import Bytes
 from mlbatch.writers.scan_folder import FolderWriter
 
 FORMAT = "npz"
