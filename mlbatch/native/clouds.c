@@ -1,6 +1,6 @@
 /* Points of decoded clouds: from the rows of a message to packets of columns.
 
-   The same values as `ros/pointcloud2.py` and `ros/point_packets.py` compute by numpy. */
+   Called by `ros/point_rows.py` and `ros/point_packets.py`, and by `ros/row_packer.py`. */
 #include <math.h>
 #include <string.h>
 
@@ -238,143 +238,36 @@ EXPORT int64_t mlbatch_cloud_columns(int64_t count, const int64_t *stamp_ns, con
     return base + layers;
 }
 
-/* Add the sorted, distinct stamps `added` to the sorted `stamps`; in place, from the end. */
-static void insert_stamps(int64_t *stamps, int64_t known, const int64_t *added, int64_t count)
-{
-    int64_t to = known + count;
-    while (count)
-        stamps[--to] = known && stamps[known - 1] > added[count - 1] ? stamps[--known]
-                                                                      : added[--count];
-}
-
-/* The order of the points without a sort: clouds are a few runs in which stamps do not fall, mostly
-   one, or one a ring. stamps (count,): the distinct ones; spare (count,): scratch; column (count,):
-   number of the stamp of each point; begins (MOST_RUNS + 1,): first point of each run, and the end.
-   Return the number of runs, 0 where there are too many, or their stamps differ too much. */
-EXPORT int64_t mlbatch_cloud_runs(int64_t count, const int64_t *stamp_ns, int64_t *stamps,
-                            int64_t *spare, int32_t *column, int64_t *begins,
-                            int64_t *stamp_count)
-{
-    int64_t runs = 1, longest = 0;
-    begins[0] = 0;
-    for (int64_t point = 1; point < count; point++)
-        if (stamp_ns[point] < stamp_ns[point - 1]) {
-            if (runs == MOST_RUNS)
-                return 0;
-            begins[runs++] = point;
-        }
-    begins[runs] = count;
-    for (int64_t run = 1; run < runs; run++)
-        if (begins[run + 1] - begins[run] > begins[longest + 1] - begins[longest])
-            longest = run;
-    /* The longest run first, since it has most of the stamps of the others. */
-    int64_t known = 0;
-    for (int64_t point = begins[longest]; point < begins[longest + 1]; point++)
-        if (!known || stamps[known - 1] != stamp_ns[point])
-            stamps[known++] = stamp_ns[point];
-    int64_t work = 0;
-    for (int64_t run = 0; run < runs; run++) {
-        int64_t at = 0, added = 0;
-        for (int64_t point = begins[run]; point < begins[run + 1]; point++) {
-            const int64_t stamp = stamp_ns[point];
-            while (at < known && stamps[at] < stamp)
-                at++;
-            if ((at == known || stamps[at] != stamp) && (!added || spare[added - 1] != stamp))
-                spare[added++] = stamp;
-        }
-        if (!added)
-            continue;
-        work += known + added;
-        if (work > 2 * count)
-            return 0;
-        insert_stamps(stamps, known, spare, added);
-        known += added;
-    }
-    for (int64_t run = 0; run < runs; run++) {
-        int64_t at = 0;
-        for (int64_t point = begins[run]; point < begins[run + 1]; point++) {
-            while (stamps[at] != stamp_ns[point])
-                at++;
-            column[point] = (int32_t)at;
-        }
-    }
-    *stamp_count = known;
-    return runs;
-}
-
-/* Stamps (numbers in `column`) to columns, and the slot of each point; ring: NULL: slots in turn.
-   used (stamp_count * width,): zeros, width: slots with rings, else 1; layers (stamp_count,):
-   zeros. Return the number of columns. */
-EXPORT int64_t mlbatch_cloud_slots(int64_t count, const uint16_t *ring, int64_t slots,
-                             int64_t stamp_count, int32_t *used, int32_t *layers,
-                             int32_t *column, uint16_t *slot)
-{
-    int is_flat = 1;
-    for (int64_t point = 0; point < count; point++) {
-        const int64_t stamp = column[point];
-        const int32_t before = ring ? used[stamp * slots + ring[point]]++ : used[stamp]++;
-        const int32_t layer = ring ? before : (int32_t)(before / slots);
-        slot[point] = (uint16_t)(ring ? ring[point] : before % slots);
-        layers[stamp] = layer + 1 > layers[stamp] ? layer + 1 : layers[stamp];
-        is_flat &= !layer;
-    }
-    if (is_flat)
-        return stamp_count;
-    /* From numbers of columns to the first column. */
-    int32_t columns = 0;
-    for (int64_t stamp = 0; stamp < stamp_count; stamp++) {
-        const int32_t own = layers[stamp];
-        layers[stamp] = columns;
-        columns += own;
-    }
-    memset(used, 0, (size_t)(stamp_count * (ring ? slots : 1)) * sizeof *used);
-    for (int64_t point = 0; point < count; point++) {
-        const int64_t stamp = column[point];
-        const int32_t before = ring ? used[stamp * slots + ring[point]]++ : used[stamp]++;
-        column[point] = layers[stamp] + (ring ? before : (int32_t)(before / slots));
-    }
-    return columns;
-}
-
 /* Write the points to packets of `size` bytes, all zero but their heads: `HEAD` of
    point_packets.py, of which stamps, numbers and counts are written here.
 
-   column, slot (count,): of the points, in `order` (NULL: their own). begins (runs + 1,): runs in
-   which columns do not fall. used (columns,): zeros. ring, return_type, tag: NULL: zeros. */
-EXPORT void mlbatch_cloud_pack(const int64_t *order, int64_t runs, const int64_t *begins,
-                         const int32_t *column, const uint16_t *slot, const int64_t *stamp_ns,
-                         int64_t room, const float *reals, const uint16_t *ring,
-                         const uint8_t *return_type, const uint8_t *tag, int64_t slots,
-                         int64_t size, int64_t columns, uint16_t *used, uint8_t *packets)
+   column, slot (count,): of the points, in `order` (NULL: their own). used (columns,): zeros.
+   ring, return_type, tag: NULL: zeros. */
+EXPORT void mlbatch_cloud_pack(int64_t count, const int64_t *order, const int32_t *column,
+                         const uint16_t *slot, const int64_t *stamp_ns, int64_t room,
+                         const float *reals, const uint16_t *ring, const uint8_t *return_type,
+                         const uint8_t *tag, int64_t slots, int64_t size, int64_t columns,
+                         uint16_t *used, uint8_t *packets)
 {
-    enum { STAMP = 8, NUMBER = 16, COUNT = 20, HEAD = 24, COLUMNS_TOGETHER = 64 };
-    int64_t next[MOST_RUNS];
-    memcpy(next, begins, (size_t)runs * sizeof *next);
-    /* Some columns of all runs, whose packets stay in the cache. */
-    const int64_t step = runs > 1 ? COLUMNS_TOGETHER : columns;
-    for (int64_t end = step; end < columns + step; end += step)
-        for (int64_t run = 0; run < runs; run++) {
-            int64_t number = next[run];
-            for (; number < begins[run + 1] && column[number] < end; number++) {
-                const int64_t point = order ? order[number] : number;
-                const int64_t at = slot[number];
-                uint8_t *packet = packets + column[number] * size;
-                uint8_t *plane = packet + HEAD + at * 4;
-                for (int64_t real = 0; real < REALS; real++, plane += 4 * slots)
-                    memcpy(plane, reals + real * room + point, 4);
-                plane = packet + HEAD + 4 * REALS * slots;
-                if (ring)
-                    memcpy(plane + 2 * at, ring + point, 2);
-                plane += 2 * slots;
-                if (return_type)
-                    plane[at] = return_type[point];
-                if (tag)
-                    plane[slots + at] = tag[point];
-                if (!used[column[number]]++)
-                    memcpy(packet + STAMP, stamp_ns + point, 8);
-            }
-            next[run] = number;
-        }
+    enum { STAMP = 8, NUMBER = 16, COUNT = 20, HEAD = 24 };
+    for (int64_t number = 0; number < count; number++) {
+        const int64_t point = order ? order[number] : number;
+        const int64_t at = slot[number];
+        uint8_t *packet = packets + column[number] * size;
+        uint8_t *plane = packet + HEAD + at * 4;
+        for (int64_t real = 0; real < REALS; real++, plane += 4 * slots)
+            memcpy(plane, reals + real * room + point, 4);
+        plane = packet + HEAD + 4 * REALS * slots;
+        if (ring)
+            memcpy(plane + 2 * at, ring + point, 2);
+        plane += 2 * slots;
+        if (return_type)
+            plane[at] = return_type[point];
+        if (tag)
+            plane[slots + at] = tag[point];
+        if (!used[column[number]]++)
+            memcpy(packet + STAMP, stamp_ns + point, 8);
+    }
     for (int64_t number = 0; number < columns; number++) {
         const uint32_t own = (uint32_t)number;
         memcpy(packets + number * size + NUMBER, &own, 4);

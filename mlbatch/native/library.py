@@ -41,8 +41,6 @@ _FUNCTIONS: dict[str, tuple[type[Any], ...]] = {
     ),
     "mlbatch_cloud_order": (_WORD, *[_ADDRESS] * 5),
     "mlbatch_cloud_columns": (_WORD, *[_ADDRESS] * 3, _WORD, _WORD, _ADDRESS, _ADDRESS),
-    "mlbatch_cloud_runs": (_WORD, *[_ADDRESS] * 6),
-    "mlbatch_cloud_slots": (_WORD, _ADDRESS, _WORD, _WORD, *[_ADDRESS] * 4),
     "mlbatch_cloud_times": (
         *(_WORD, _ADDRESS, _WORD, _ADDRESS, _WORD, _WORD, _WORD),
         *[_ADDRESS] * 7,
@@ -52,8 +50,8 @@ _FUNCTIONS: dict[str, tuple[type[Any], ...]] = {
         *(_WORD, _ADDRESS, _ADDRESS, _WORD, _WORD, *[_ADDRESS] * 3),
     ),
     "mlbatch_cloud_pack": (
-        *(_ADDRESS, _WORD, *[_ADDRESS] * 4),
-        *(_WORD, *[_ADDRESS] * 4, *[_WORD] * 3, _ADDRESS, _ADDRESS),
+        *(_WORD, *[_ADDRESS] * 4, _WORD, *[_ADDRESS] * 4),
+        *(*[_WORD] * 3, _ADDRESS, _ADDRESS),
     ),
 }
 _WITHOUT_RESULT = (

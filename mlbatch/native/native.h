@@ -386,17 +386,11 @@ EXPORT int64_t mlbatch_cloud_order(int64_t count, const int64_t *stamp_ns, const
 EXPORT int64_t mlbatch_cloud_columns(int64_t count, const int64_t *stamp_ns, const uint16_t *ring,
                                const int64_t *order, int64_t slots, int64_t by_ring,
                                int32_t *column, uint16_t *slot);
-EXPORT int64_t mlbatch_cloud_runs(int64_t count, const int64_t *stamp_ns, int64_t *stamps,
-                            int64_t *spare, int32_t *column, int64_t *begins,
-                            int64_t *stamp_count);
-EXPORT int64_t mlbatch_cloud_slots(int64_t count, const uint16_t *ring, int64_t slots,
-                             int64_t stamp_count, int32_t *used, int32_t *layers,
-                             int32_t *column, uint16_t *slot);
-EXPORT void mlbatch_cloud_pack(const int64_t *order, int64_t runs, const int64_t *begins,
-                         const int32_t *column, const uint16_t *slot, const int64_t *stamp_ns,
-                         int64_t room, const float *reals, const uint16_t *ring,
-                         const uint8_t *return_type, const uint8_t *tag, int64_t slots,
-                         int64_t size, int64_t columns, uint16_t *used, uint8_t *packets);
+EXPORT void mlbatch_cloud_pack(int64_t count, const int64_t *order, const int32_t *column,
+                         const uint16_t *slot, const int64_t *stamp_ns, int64_t room,
+                         const float *reals, const uint16_t *ring, const uint8_t *return_type,
+                         const uint8_t *tag, int64_t slots, int64_t size, int64_t columns,
+                         uint16_t *used, uint8_t *packets);
 EXPORT int64_t mlbatch_cloud_times(int64_t count, const uint8_t *rows, int64_t step,
                              const int64_t *axes_at, int64_t time_at, int64_t time_type,
                              int64_t room, uint8_t *times, int32_t *number, int32_t *by_order,

@@ -8,15 +8,15 @@ return type and tag (uint8); zeros up to a multiple of 8 bytes. A slot at x = y 
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TypeAlias
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
 from mlbatch.arrays import BoolArray, F32Array, I64Array, U8Array, U16Array
 from mlbatch.errors import RecordingError
+from mlbatch.native.library import address, library
 
 # Source of the points, by its number in packets.
 KINDS = ("PointCloud2", "CustomMsg")
@@ -116,24 +116,19 @@ class Layout:
 
 def layout_of(points: Points, kind: int) -> Layout:
     """The layout for the first cloud of a topic, and then for all of them."""
-    order, is_first = _by_stamp(points)
     if points.ring is not None and int(points.ring.max()) < MOST_SLOTS:
         rings = int(points.ring.max()) + 1
-        slots = next(slots for slots in _RING_SLOTS if slots >= rings)
-        column = _column(_same_ring(points.ring[order], is_first), is_first)
-        if slots * (int(column.max()) + 1) <= _MOST_PER_POINT * len(points):
-            return Layout(kind, slots, by_ring=True)
-    starts = is_first.nonzero()[0]
-    if len(starts) == 1:
+        by_ring = Layout(kind, next(s for s in _RING_SLOTS if s >= rings), by_ring=True)
+        if by_ring.slots * _placed(points, by_ring).columns <= _MOST_PER_POINT * len(points):
+            return by_ring
+    # A column for each stamp.
+    stamps = _placed(points, Layout(kind, len(points)))
+    if stamps.columns == 1:
         return Layout(kind, min(len(points), _DEFAULT_SLOTS))
-    widest = int(np.diff(starts, append=len(points)).max())
+    widest = int(np.bincount(stamps.column).max())
     # Few long runs among short ones are split, so that most slots are used.
-    usual = 2 * len(points) // len(starts) - 1
+    usual = 2 * len(points) // stamps.columns - 1
     return Layout(kind, min(widest, usual, MOST_SLOTS))
-
-
-# Packs the points of one message; `ros.native_points` has a compiled one.
-Pack: TypeAlias = Callable[["Points", "Layout", int], U8Array]
 
 
 def pack(points: Points, layout: Layout, message_bytes: int) -> U8Array:
@@ -141,32 +136,36 @@ def pack(points: Points, layout: Layout, message_bytes: int) -> U8Array:
 
     With slots by ring, all rings are below `layout.slots`.
     """
-    order, is_first = _by_stamp(points)
-    rings = np.zeros(len(points), np.uint16) if points.ring is None else points.ring
-    if layout.by_ring:
-        slot = rings[order].astype(np.int64)
-        column = _column(_same_ring(slot, is_first), is_first)
-    else:
-        rank = _rank(is_first)
-        slot = rank % layout.slots
-        column = _column(rank // layout.slots, is_first)
-    # The last ring of the last time may have fewer points than others.
-    columns = int(column.max()) + 1
-    size = layout.size
+    placed = _placed(points, layout)
+    columns = placed.columns
     check_columns(columns, len(points), layout, message_bytes)
-    packets = np.zeros((columns, size), np.uint8)
-    head = packets[:, : HEAD.itemsize].view(HEAD)[:, 0]
-    head[:] = layout.begin
-    head["number"] = np.arange(columns)
-    head["stamp_ns"][column] = points.stamp_ns[order]
-    head["count"] = np.bincount(column)
-    flat = packets.reshape(-1)
-    at = HEAD.itemsize
-    for plane in (*points.reals, rings, points.return_type, points.tag):
-        width = plane.dtype.itemsize
-        place = column * (size // width) + (at // width + slot)
-        flat.view(plane.dtype.newbyteorder("<"))[place] = plane[order]
-        at += width * layout.slots
+    packets = np.zeros((columns, layout.size), np.uint8)
+    packets[:, : HEAD.itemsize] = layout.begin.view(np.uint8)
+    reals = points.reals
+    if reals.strides[1] != reals.itemsize:
+        reals = np.ascontiguousarray(reals)
+    stamp_ns = np.ascontiguousarray(points.stamp_ns)
+    ring = None if points.ring is None else np.ascontiguousarray(points.ring)
+    return_type = np.ascontiguousarray(points.return_type)
+    tag = np.ascontiguousarray(points.tag)
+    used = np.zeros(columns, np.uint16)
+    library().mlbatch_cloud_pack(
+        len(points),
+        _address(placed.order),
+        address(placed.column),
+        address(placed.slot),
+        address(stamp_ns),
+        reals.strides[0] // reals.itemsize,
+        reals.__array_interface__["data"][0],
+        _address(ring),
+        address(return_type),
+        address(tag),
+        layout.slots,
+        layout.size,
+        columns,
+        address(used),
+        address(packets),
+    )
     return packets
 
 
@@ -179,40 +178,45 @@ def check_columns(columns: int, points: int, layout: Layout, message_bytes: int)
         )
 
 
-def _by_stamp(points: Points) -> tuple[I64Array, BoolArray]:
-    """Points by stamp, then ring, then message order: their order, and which begin a new stamp.
+class _Placed(NamedTuple):
+    """Column and slot of points (n,), by `order` (None: their own); columns: their number."""
 
-    The stamps are within seconds, so that a ring fits below them in 64 bits.
-    """
-    key = (points.stamp_ns - points.stamp_ns.min()) << 16
-    if points.ring is not None:
-        key |= points.ring
-    order: I64Array = np.arange(len(key))
-    if bool((key[1:] < key[:-1]).any()):
-        order = np.argsort(key, kind="stable")
-    stamp_ns = points.stamp_ns[order]
-    is_first = np.ones(len(key), np.bool_)
-    np.not_equal(stamp_ns[1:], stamp_ns[:-1], out=is_first[1:])
-    return order, is_first
+    columns: int
+    column: npt.NDArray[np.int32]
+    slot: U16Array
+    order: I64Array | None
 
 
-def _rank(is_first: BoolArray) -> I64Array:
-    """Place of each element in its run; runs begin where `is_first`."""
-    place = np.arange(len(is_first))
-    begin: I64Array = np.maximum.accumulate(np.where(is_first, place, 0))
-    return place - begin
+def _placed(points: Points, layout: Layout) -> _Placed:
+    """Points by stamp, then ring, then message order, in columns."""
+    loops = library()
+    count = len(points)
+    stamp_ns = np.ascontiguousarray(points.stamp_ns)
+    ring = None if points.ring is None else np.ascontiguousarray(points.ring)
+    order: I64Array | None = np.empty(count, np.int64)
+    words, spare = np.empty((2, count), np.uint64)
+    state = loops.mlbatch_cloud_order(
+        count, address(stamp_ns), _address(ring), address(words), address(spare), _address(order)
+    )
+    if state < 0:
+        # Stamps so far apart that no word takes them with ring and number.
+        order = np.lexsort((np.zeros(count) if ring is None else ring, stamp_ns))
+    elif state:
+        order = None
+    column = np.empty(count, np.int32)
+    slot: U16Array = np.empty(count, np.uint16)
+    columns = loops.mlbatch_cloud_columns(
+        count,
+        address(stamp_ns),
+        _address(ring),
+        _address(order),
+        layout.slots,
+        layout.by_ring,
+        address(column),
+        address(slot),
+    )
+    return _Placed(columns, column, slot, order)
 
 
-def _same_ring(ring: U16Array | I64Array, is_first: BoolArray) -> I64Array:
-    """Number of earlier points of each point's run on its ring; rings rise in a run."""
-    begins = is_first.copy()
-    begins[1:] |= ring[1:] != ring[:-1]
-    return _rank(begins)
-
-
-def _column(layer: I64Array, is_first: BoolArray) -> I64Array:
-    """Column of each point; each run takes as many columns as it has layers."""
-    columns = np.maximum.reduceat(layer, is_first.nonzero()[0]) + 1
-    before = np.cumsum(columns) - columns
-    column: I64Array = before[np.cumsum(is_first) - 1] + layer
-    return column
+def _address(array: npt.NDArray[Any] | None) -> int | None:
+    return None if array is None else address(array)

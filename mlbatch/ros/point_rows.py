@@ -2,19 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import ctypes
 from dataclasses import dataclass
 from typing import Any, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
 
-from mlbatch.arrays import BoolArray, F32Array
+from mlbatch.arrays import F32Array
+from mlbatch.native.library import address, library
 
 # A structured array, fields named by role; numpy has no type for the fields of a dtype.
 Rows: TypeAlias = npt.NDArray[Any]
 AXES = ("x", "y", "z")
 REAL_ROLES = (*AXES, "intensity")
+# sensor_msgs/PointField, by numpy's name of the type.
+_NUMBERS = {"i1": 1, "u1": 2, "i2": 3, "u2": 4, "i4": 5, "u4": 6, "f4": 7, "f8": 8}
+# A field that is not there.
+_NONE = (0, 0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,39 +35,44 @@ class TakenRows:
     placed: int
 
 
-# Takes the points of rows (n,); `ros.native_points` has a compiled one.
-Take: TypeAlias = Callable[[Rows], TakenRows]
-
-
 def take_rows(rows: Rows) -> TakenRows:
     """The points of rows (n,)."""
-    reals = _reals(rows)
-    x, y, z, _ = reals
-    with np.errstate(over="ignore", invalid="ignore"):
-        squared = x * x + y * y + z * z
-    keep: BoolArray = (squared > 0) & (squared < np.inf)
-    placed = int(np.count_nonzero(keep))
-    time = np.ascontiguousarray(rows["time"])
-    if time.dtype.kind == "f":
-        keep &= np.isfinite(time)
-    fields = {role: rows[role] for role in rows.dtype.names or () if role not in REAL_ROLES}
-    fields["time"] = time
-    if keep.all():
-        return TakenRows(reals, {key: field.copy() for key, field in fields.items()}, placed)
-    # An index is several times faster than a mask.
-    index = keep.nonzero()[0]
-    kept = {role: field.take(index) for role, field in fields.items()}
-    return TakenRows(reals.take(index, axis=1), kept, placed)
+    known = dict(rows.dtype.fields or {})
+    reals_of = [field_of(known, name) for name in REAL_ROLES]
+    # The time is the first: it decides which points are kept.
+    roles = ["time", *(role for role in known if role not in ("time", *REAL_ROLES))]
+    others = [known[role] for role in roles]
+    count = len(rows)
+    reals = np.empty((len(REAL_ROLES), count), np.float32)
+    fields = {role: np.empty(count, known[role][0]) for role in roles}
+    targets = (ctypes.c_void_p * len(roles))(*map(address, fields.values()))
+    real_at, real_type = np.array(reals_of, np.int64).T.copy()
+    field_at = np.array([one[1] for one in others], np.int64)
+    field_bytes = np.array([one[0].itemsize for one in others], np.int64)
+    placed = np.zeros(1, np.int64)
+    kept = library().mlbatch_cloud_points(
+        count,
+        rows.__array_interface__["data"][0],
+        rows.strides[0],
+        address(real_at),
+        address(real_type),
+        _NUMBERS[known["time"][0].str[1:]],
+        len(roles),
+        address(field_at),
+        address(field_bytes),
+        count,
+        address(reals),
+        targets,
+        address(placed),
+    )
+    return TakenRows(
+        reals[:, :kept], {role: field[:kept] for role, field in fields.items()}, int(placed[0])
+    )
 
 
-def _reals(rows: Rows) -> F32Array:
-    """x, y, z and intensity, (4, n)."""
-    reals = np.zeros((len(REAL_ROLES), len(rows)), np.float32)
-    # A place beyond all float32 is infinite, and is left out as such.
-    with np.errstate(over="ignore", invalid="ignore"):
-        for plane, name in zip(reals, REAL_ROLES, strict=True):
-            if name in (rows.dtype.names or ()):
-                plane[:] = rows[name]
-    intensity = reals[3]
-    intensity[~np.isfinite(intensity)] = 0
-    return reals
+def field_of(known: dict[str, Any], name: str) -> tuple[int, int]:
+    """Byte in a row and number of the type of a field."""
+    if name not in known:
+        return _NONE
+    dtype, first = known[name][:2]
+    return first, _NUMBERS[dtype.str[1:]]

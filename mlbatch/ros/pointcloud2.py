@@ -18,7 +18,7 @@ import numpy.typing as npt
 from mlbatch.arrays import U16Array
 from mlbatch.ros.encoding import Cursor, MessageError
 from mlbatch.ros.point_packets import CloudError, Points
-from mlbatch.ros.point_rows import AXES, Rows, Take, take_rows
+from mlbatch.ros.point_rows import AXES, Rows, take_rows
 from mlbatch.ros.point_times import CONVENTION, TIME_NAMES, CloudSample, PointRule, Zero, stamps
 from mlbatch.types import Message
 
@@ -119,11 +119,11 @@ def by_convention(frame: str) -> PointRule:
     return CONVENTION
 
 
-def read_cloud(message: Message, rules: Rules = by_convention, take: Take = take_rows) -> Cloud:
+def read_cloud(message: Message, rules: Rules = by_convention) -> Cloud:
     """The points of a message; rules: by its frame_id; CloudError if they cannot be read."""
     raw = raw_cloud(message, rules)
     rule = rules(raw.frame)
-    taken = take(raw.rows)
+    taken = take_rows(raw.rows)
     fields = taken.fields
     count = len(fields["time"])
     stamp_ns = np.empty(0, np.int64)
@@ -161,10 +161,10 @@ class CloudHead:
     sample: CloudSample
 
 
-def sample_cloud(message: Message, rules: Rules, take: Take = take_rows) -> CloudHead:
+def sample_cloud(message: Message, rules: Rules) -> CloudHead:
     """Frame, lidars and times of a message as they are stored; CloudError as in `read_cloud`."""
     raw = raw_cloud(message, rules)
-    fields = take(raw.rows).fields
+    fields = take_rows(raw.rows).fields
     time = fields["time"]
     _ring(fields, rules(raw.frame))
     ids = _whole(fields, "lidar_id", np.uint16)

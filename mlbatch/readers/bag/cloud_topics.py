@@ -16,7 +16,6 @@ from mlbatch.readers.merge import merge
 from mlbatch.rig.rig import RigSensor
 from mlbatch.ros.encoding import ENCODINGS
 from mlbatch.ros.point_packets import CloudError, Layout
-from mlbatch.ros.point_rows import Take, take_rows
 from mlbatch.ros.point_times import CONVENTION, CloudSample, PointRule, ahead_ns, checked_rule
 from mlbatch.ros.pointcloud2 import CLOUD_TYPES, FieldError, read_cloud, sample_cloud
 from mlbatch.types import Message, Recording, Stream, Topic
@@ -37,16 +36,6 @@ def cloud_topics(topics: Iterable[Topic]) -> tuple[Topic, ...]:
     return tuple(
         topic for topic in topics if topic.type in CLOUD_TYPES and topic.encoding in ENCODINGS
     )
-
-
-def take_of(engine: str) -> Take:
-    """What takes the points of a message."""
-    if engine != "native":
-        return take_rows
-    # Imported on demand: the library may be missing.
-    from mlbatch.ros.native_points import take_rows_compiled
-
-    return take_rows_compiled
 
 
 @dataclass(slots=True)
@@ -145,7 +134,6 @@ class CloudTopics:
     def examine(self, recordings: Sequence[Recording]) -> None:
         """Find lidars and rules by the first messages; topics that cannot be used are removed."""
         found = {topic.name: _Examined() for topic in self.topics}
-        take = take_of(recordings[0].engine) if recordings else take_rows
         for recording in recordings:
             recording.keep = frozenset(found)
         end_ns: int | None = None
@@ -155,7 +143,7 @@ class CloudTopics:
                     end_ns = message.host_ns + _EXAMINED_NS if end_ns is None else end_ns
                     one = found[message.topic.name]
                     if one.messages < _EXAMINED:
-                        self._examine(message, one, take)
+                        self._examine(message, one)
                 last_ns = max((m.host_ns for m in batch.messages), default=0)
                 last_ns = max(last_ns, int(batch.host_ns[-1]) if len(batch) else 0)
                 is_over = end_ns is not None and last_ns > end_ns
@@ -189,11 +177,11 @@ class CloudTopics:
         is_near = bool(namespace) and name.startswith(f"{namespace}/")
         return is_near or bool(self.lidars[name].frames & self.lidars[of].frames)
 
-    def _examine(self, message: Message, examined: _Examined, take: Take) -> None:
+    def _examine(self, message: Message, examined: _Examined) -> None:
         name = message.topic.name
         examined.messages += 1
         try:
-            head = sample_cloud(message, lambda frame: self._given(name, frame), take)
+            head = sample_cloud(message, lambda frame: self._given(name, frame))
         except FieldError as err:
             raise RigError(str(err)) from err
         except CloudError as err:

@@ -11,18 +11,17 @@ from __future__ import annotations
 
 from collections.abc import Generator, Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from mlbatch.arrays import I64Array, U8Array
 from mlbatch.lidar.content_keys import hash_factors
 from mlbatch.native.arena import PacketArena
-from mlbatch.readers.bag.cloud_topics import CloudTopics, take_of
-from mlbatch.ros.point_packets import HEAD, CloudError, Pack, Points, layout_of, pack
-from mlbatch.ros.point_rows import Take, take_rows
+from mlbatch.readers.bag.cloud_topics import CloudTopics
+from mlbatch.ros.point_packets import HEAD, CloudError, Points, layout_of, pack
 from mlbatch.ros.point_times import stamps
 from mlbatch.ros.pointcloud2 import CLOUD_TYPES, Cloud, raw_cloud, read_cloud
+from mlbatch.ros.row_packer import PackedRows, RowPacker
 from mlbatch.types import (
     Message,
     PacketBatch,
@@ -31,9 +30,6 @@ from mlbatch.types import (
     StreamTable,
     WrappedRecording,
 )
-
-if TYPE_CHECKING:
-    from mlbatch.ros.native_rows import PackedRows, RowPacker
 
 # A batch ends when this many bytes of packets have been made.
 _BATCH_BYTES = 8 << 20
@@ -94,17 +90,6 @@ class _TopicCounts:
         return f"{start}left out of {self.points} points: {left_out}"
 
 
-def _loops(engine: str) -> tuple[Take, Pack, RowPacker | None]:
-    """What takes the points of a message, what packs them, and what does both at once."""
-    if engine != "native":
-        return take_of(engine), pack, None
-    # Imported on demand: the library may be missing.
-    from mlbatch.ros.native_points import pack_compiled
-    from mlbatch.ros.native_rows import RowPacker
-
-    return take_of(engine), pack_compiled, RowPacker()
-
-
 class _Room:
     """Memory for the packets of a cloud: in an arena, at `place`."""
 
@@ -137,7 +122,7 @@ class CloudRecording(WrappedRecording):
     """
 
     __slots__ = (
-        *("_arena", "_counts", "_next_arena", "_pack_points", "_pack_rows", "_scratch", "_take"),
+        *("_arena", "_counts", "_next_arena", "_pack_rows", "_scratch"),
         *("clouds", "streams"),
     )
 
@@ -146,9 +131,7 @@ class CloudRecording(WrappedRecording):
         self.streams = streams
         self.clouds = clouds
         self._counts: dict[str, _TopicCounts] = {}
-        self._take: Take = take_rows
-        self._pack_points: Pack = pack
-        self._pack_rows: RowPacker | None = None
+        self._pack_rows = RowPacker()
         # For packets of this pass, and of the next one; `_scratch`: where none is given.
         self._scratch = PacketArena()
         self._arena = self._scratch
@@ -177,7 +160,6 @@ class CloudRecording(WrappedRecording):
     def packets(self) -> Generator[PacketBatch, None, None]:
         """Yield all packets from the start, those of clouds among them; each call is a new pass."""
         self._counts = {topic.name: _TopicCounts() for topic in self.clouds.topics}
-        self._take, self._pack_points, self._pack_rows = _loops(self.inner.engine)
         arena = self._next_arena
         self._next_arena = None
         self._scratch = PacketArena()
@@ -233,7 +215,7 @@ class CloudRecording(WrappedRecording):
             at_once = self._packed_at_once(message)
             if at_once is not None:
                 return [at_once]
-            cloud = read_cloud(message, lambda frame: self.clouds.rule(name, frame), self._take)
+            cloud = read_cloud(message, lambda frame: self.clouds.rule(name, frame))
             packed = [
                 _Packed(message, stream, packets)
                 for stream, points in self._by_lidar(name, cloud)
@@ -255,7 +237,7 @@ class CloudRecording(WrappedRecording):
         """The packets of a usual cloud of one lidar that has a layout; None for others."""
         name = message.topic.name
         lidars = self.clouds.lidars[name]
-        if self._pack_rows is None or not lidars.frames:
+        if not lidars.frames:
             return None
         raw = raw_cloud(message, lambda frame: self.clouds.rule(name, frame))
         if raw.lidar_id is not None:
@@ -315,7 +297,7 @@ class CloudRecording(WrappedRecording):
                 beyond = len(points) - int(np.count_nonzero(known))
                 self._counts[stream.topic].beyond_rings += beyond
                 points = points.take(known)
-        return self._pack_points(points, layout, len(message.data)) if len(points) else None
+        return pack(points, layout, len(message.data)) if len(points) else None
 
     def _joined(self, batch: PacketBatch, packed: Sequence[_Packed]) -> PacketBatch:
         """Packets of the recording and of its clouds, in receive order."""

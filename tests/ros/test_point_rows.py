@@ -1,4 +1,4 @@
-"""Points of clouds by compiled loops: the bytes that numpy gives, for rows of any fields."""
+"""Points of clouds: the literal bytes, for rows of any fields and points in any order."""
 
 from __future__ import annotations
 
@@ -8,16 +8,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mlbatch.native.library import trouble
 from mlbatch.ros.point_packets import CloudError, Layout, Points, layout_of, pack
 from mlbatch.ros.point_rows import Rows, take_rows
-from tests.builders.engines import needs_native
 from tests.builders.points import read_packets
-
-pytestmark = needs_native
-
-if not trouble():
-    from mlbatch.ros.native_points import pack_compiled, take_rows_compiled
+from tests.reference.clouds import packets_of, taken_rows
 
 STAMP_NS = 1_700_000_000_000_000_000
 WHOLE = ("i1", "u1", "<i2", "<u2", "<i4", "<u4")
@@ -58,9 +52,9 @@ def rows(draw: st.DrawFn) -> Rows:
 
 @settings(max_examples=150)
 @given(rows())
-def test_rows_are_taken_as_by_numpy(given_rows: Rows) -> None:
-    expected = take_rows(given_rows)
-    found = take_rows_compiled(given_rows)
+def test_rows_are_taken_literally(given_rows: Rows) -> None:
+    expected = taken_rows(given_rows)
+    found = take_rows(given_rows)
     assert found.placed == expected.placed
     assert found.reals.tobytes() == expected.reals.tobytes()
     assert found.fields.keys() == expected.fields.keys()
@@ -97,15 +91,15 @@ def _points(
 
 
 def _assert_equal(points: Points, layout: Layout) -> None:
-    expected = pack(points, layout, 1 << 30)
-    found = pack_compiled(points, layout, 1 << 30)
+    expected = packets_of(points, layout)
+    found = pack(points, layout, 1 << 30)
     assert found.shape == expected.shape
     assert found.tobytes() == expected.tobytes()
 
 
 @pytest.mark.parametrize("order", ["column", "ring", "none"])
 @pytest.mark.parametrize(("rings", "columns"), [(16, 300), (64, 200), (128, 130), (1, 700)])
-def test_clouds_of_a_spinning_lidar_are_packed_as_by_numpy(
+def test_clouds_of_a_spinning_lidar_are_packed_literally(
     rings: int, columns: int, order: str
 ) -> None:
     points = _columns_of(rings, columns, order, np.random.default_rng(rings + columns))
@@ -121,7 +115,7 @@ def test_clouds_of_a_spinning_lidar_are_packed_as_by_numpy(
     st.one_of(st.none(), st.integers(1, 60)),
     st.one_of(st.none(), st.integers(1, 9)),
 )
-def test_points_in_any_order_are_packed_as_by_numpy(
+def test_points_in_any_order_are_packed_literally(
     size: tuple[int, int, int], step_ns: int, rings: int | None, slots: int | None
 ) -> None:
     count, seed, times = size
@@ -132,7 +126,7 @@ def test_points_in_any_order_are_packed_as_by_numpy(
     _assert_equal(points, layout_of(points, 1) if slots is None else Layout(1, slots))
 
 
-def test_many_short_runs_are_packed_as_by_numpy() -> None:
+def test_many_short_runs_are_packed_literally() -> None:
     """More runs than the loops follow at once."""
     random = np.random.default_rng(1)
     points = _points(np.tile([3, 2, 1, 0], 400), None, random)
@@ -152,14 +146,14 @@ def test_a_point_of_each_ring_by_hand() -> None:
     reals = np.array([[1, 2, 3], [0, 0, 0], [0, 0, 0], [7, 8, 9]], np.float32)
     stamp_ns = np.array([0, 0, 50], np.int64) + STAMP_NS
     points = Points(stamp_ns, reals, np.array([0, 1, 1], np.uint16), nothing, nothing)
-    first, second = read_packets(pack_compiled(points, Layout(0, 2, by_ring=True), 0))
+    first, second = read_packets(pack(points, Layout(0, 2, by_ring=True), 0))
     assert (first.stamp_ns, first.number, first.count, first.x) == (STAMP_NS, 0, 2, (1, 2))
     assert (second.stamp_ns, second.number, second.count) == (STAMP_NS + 50, 1, 1)
     assert (second.x, second.level, second.ring) == ((0, 3), (0, 9), (0, 1))
 
 
-def test_memory_is_bounded_by_compiled_loops() -> None:
+def test_memory_is_bounded() -> None:
     random = np.random.default_rng(1)
     points = _points(np.arange(10_000), None, random)
     with pytest.raises(CloudError, match="expected points that share times as in the first cloud"):
-        pack_compiled(points, Layout(0, 256), 22 * 10_000)
+        pack(points, Layout(0, 256), 22 * 10_000)

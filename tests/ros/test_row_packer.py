@@ -1,4 +1,4 @@
-"""Rows of clouds straight to packets: the bytes of numpy, or nothing for unusual clouds."""
+"""Rows of clouds straight to packets: the literal bytes, or nothing for unusual clouds."""
 
 from __future__ import annotations
 
@@ -13,16 +13,11 @@ from hypothesis import strategies as st
 
 from mlbatch.arrays import I64Array, U8Array
 from mlbatch.lidar.content_keys import content_keys, hash_factors
-from mlbatch.native.library import trouble
-from mlbatch.ros.point_packets import CloudError, Layout, Points, pack
-from mlbatch.ros.point_rows import Rows, take_rows
-from tests.builders.engines import needs_native
+from mlbatch.ros.point_packets import CloudError, Layout, Points
+from mlbatch.ros.point_rows import Rows
+from mlbatch.ros.row_packer import PackedRows, RowPacker
 from tests.builders.points import read_packets
-
-pytestmark = needs_native
-
-if not trouble():
-    from mlbatch.ros.native_rows import PackedRows, RowPacker
+from tests.reference.clouds import packets_of, taken_rows
 
 STAMP_NS = 1_700_000_000_000_000_000
 BIG = 1 << 30
@@ -52,9 +47,9 @@ def packed_bytes(rows: Rows, slots: int) -> U8Array:
     return found.packets
 
 
-def assert_as_by_numpy(rows: Rows, slots: int) -> None:
-    """Compare packets, counts and keys with those of the functions in numpy."""
-    taken = take_rows(rows)
+def assert_as_literally(rows: Rows, slots: int) -> None:
+    """Compare packets, counts and keys with the literal ones."""
+    taken = taken_rows(rows)
     fields = taken.fields
     nothing = np.zeros(len(taken.reals[0]), np.uint8)
     points = Points(
@@ -64,7 +59,7 @@ def assert_as_by_numpy(rows: Rows, slots: int) -> None:
         fields.get("return_type", nothing),
         fields.get("tag", nothing),
     )
-    expected = pack(points, Layout(0, slots, by_ring=True), BIG)
+    expected = packets_of(points, Layout(0, slots, by_ring=True))
     found = packed(rows, slots)
     assert found is not None
     assert found.packets.shape == expected.shape
@@ -129,7 +124,7 @@ def test_clouds_of_a_spinning_lidar_are_packed_as_by_numpy(
     if intensity:
         kinds["intensity"] = intensity
     rows = spinning(*size, order, kinds, np.random.default_rng(seed))
-    assert_as_by_numpy(rows, 256 if size[0] > 64 else 64)
+    assert_as_literally(rows, 256 if size[0] > 64 else 64)
 
 
 def simple(points: Sequence[tuple[float, int, int]]) -> Rows:
@@ -149,23 +144,23 @@ def test_a_time_that_only_a_later_ring_has_is_inserted() -> None:
     assert [one.stamp_ns - STAMP_NS for one in columns] == [10, 20, 30, 40]
     assert [one.count for one in columns] == [1, 1, 2, 1]
     assert [one.x[:2] for one in columns] == [(1, 0), (0, 3), (2, 4), (0, 5)]
-    assert_as_by_numpy(rows, 16)
+    assert_as_literally(rows, 16)
 
 
 def test_times_of_shots_without_a_place_are_no_columns() -> None:
     rows = simple([(0, 5, 0), (1, 10, 0), (0, 15, 0), (2, 20, 0), (0, 4_000_000_000, 0)])
-    assert_as_by_numpy(rows, 16)
+    assert_as_literally(rows, 16)
     # Times that are wrong where there is no place.
-    assert_as_by_numpy(simple([(1, 10, 0), (0, 0, 0), (2, 20, 0), (0, 7, 0), (3, 30, 1)]), 16)
+    assert_as_literally(simple([(1, 10, 0), (0, 0, 0), (2, 20, 0), (0, 7, 0), (3, 30, 1)]), 16)
 
 
 def test_shots_without_a_place_do_not_end_a_run() -> None:
     """By hand: in the second run the shot at 30 has no place, and 20 comes behind it."""
     points = [(1, 10, 0), (2, 20, 0), (3, 30, 0), (4, 10, 1), (0, 30, 1), (5, 20, 1), (6, 30, 1)]
-    assert_as_by_numpy(simple(points), 16)
+    assert_as_literally(simple(points), 16)
     # A time that only shots without a place have comes between those of points.
     points = [(1, 10, 0), (0, 20, 0), (3, 30, 0), (4, 10, 1), (0, 20, 1), (6, 30, 1)]
-    assert_as_by_numpy(simple(points), 16)
+    assert_as_literally(simple(points), 16)
     assert [one.count for one in read_packets(packed_bytes(simple(points), 16))] == [2, 2]
 
 
@@ -177,7 +172,7 @@ def test_times_without_a_value_are_left_out_and_counted() -> None:
     found = packed(rows, 16)
     assert found is not None
     assert (found.placed, found.points) == (5, 3)
-    assert_as_by_numpy(rows, 16)
+    assert_as_literally(rows, 16)
 
 
 @pytest.mark.parametrize(

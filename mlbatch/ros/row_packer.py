@@ -16,9 +16,8 @@ import numpy.typing as npt
 
 from mlbatch.arrays import I64Array, U8Array, U64Array
 from mlbatch.native.library import address, library
-from mlbatch.ros.native_points import MOST_RUNS, field_of
 from mlbatch.ros.point_packets import Layout, check_columns
-from mlbatch.ros.point_rows import AXES, Rows
+from mlbatch.ros.point_rows import AXES, Rows, field_of
 
 # In the order of `clouds.c`, and types that these fields may have; None: any.
 _ROLES = (*AXES, "intensity", "ring", "return_type", "tag")
@@ -29,6 +28,8 @@ _TYPES: dict[str, tuple[str, ...]] = {
     "tag": ("u1",),
     "time": ("i4", "u4", "f4", "f8"),
 }
+# As in `clouds.c`.
+_MOST_RUNS = 512
 # Distinct times of the points of a cloud that are followed.
 _MOST_TIMES = 1 << 15
 
@@ -81,7 +82,7 @@ class RowPacker:
             np.empty(_MOST_TIMES, np.int32),
             np.empty(_MOST_TIMES, np.uint8),
             np.empty(_MOST_TIMES + 1, np.int32),
-            np.empty(MOST_RUNS + 1, np.int64),
+            np.empty(_MOST_RUNS + 1, np.int64),
             np.empty(3, np.int64),
         )
         self._scratch_at = [address(one) for one in self._scratch]
