@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from mlbatch.native import library_path
 
-_ABI = 14
+_ABI = 15
 _WORD = ctypes.c_int64
 _ADDRESS = ctypes.c_void_p
 _NUMBER = ctypes.c_double

@@ -16,7 +16,7 @@
 #endif
 
 /* To be changed with every change of a struct or of a signature. */
-#define MLBATCH_ABI 14
+#define MLBATCH_ABI 15
 
 #if defined(_WIN32)
 #define EXPORT __declspec(dllexport)
