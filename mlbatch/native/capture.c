@@ -492,6 +492,10 @@ EXPORT int64_t mlbatch_dissect(Dissection *all, uint8_t *data, int64_t first, in
         int verdict = read_frame(data, start[frame], stop, link[frame], &packet);
         if (verdict >= WHOLE && captured[frame] < original[frame])
             verdict = TRUNCATED;
+        /* The next frame is likely to be copied, too. */
+        if (verdict == PART && frame + 1 < frames)
+            for (int64_t line = 0; line < captured[frame + 1]; line += LINE)
+                prefetch(data + start[frame + 1] + line);
         if (verdict == WHOLE)
             deliver(all, data, packet.key, packet.start, host_ns[frame]);
         else if (verdict == PART)
