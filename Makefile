@@ -99,7 +99,7 @@ fuzz-sanitized: $(VENV)/dev.stamp
 	$(CC) -std=c11 -g -O1 -fno-omit-frame-pointer -ffp-contract=off -fsanitize=address,undefined \
 		-fno-sanitize-recover=all -fPIC -shared -o build/native-sanitized.so mlbatch/native/*.c
 	LD_PRELOAD="$$($(CC) -print-file-name=libasan.so) $$($(CC) -print-file-name=libubsan.so)" \
-		ASAN_OPTIONS=detect_leaks=0 MLBATCH_NATIVE=$(CURDIR)/build/native-sanitized.so \
+		ASAN_OPTIONS=detect_leaks=0:quarantine_size_mb=16 MLBATCH_NATIVE=$(CURDIR)/build/native-sanitized.so \
 		$(BIN)/python -m tests.fuzz.run --target compiled --inputs $(INPUTS) --seed $(SEED) --minutes $(MINUTES)
 
 clean:

@@ -452,7 +452,10 @@ def _difference_of_output(
 
     report = target.report or report_paths(output, name).report
     identity = read_identity(report if job.shard is None else output / SHARD_JSON)
-    return difference_of_outputs(identity, identity_of(job, name, options)) if identity else ""
+    own = {} if job.shard is None else {"shard": str(job.shard)}
+    return (
+        difference_of_outputs(identity, identity_of(job, name, options) | own) if identity else ""
+    )
 
 
 def _files(job: Job, output: Path, name: str, options: WriterOptions, *, resumes: bool) -> Files:

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from mlbatch.arrays import F64Array
+from mlbatch.arrays import F64Array, I64Array
 from mlbatch.bounded import read_text
 from mlbatch.errors import RigError
 from mlbatch.motion.se3 import rotations_of
@@ -28,6 +28,8 @@ _DIGITS = 9
 _LEVEL_DEG = 20.0
 _LYING_DEG = 45.0
 _LEVEL_SHARE = 0.95
+# Of the fastest trains twice.
+_MOST_SPEED = 200.0
 # Of stamps: 2038; a count of ms, us or ns is beyond.
 _LATEST_NS = 2**31 * NS_PER_S
 
@@ -63,9 +65,21 @@ def read_tum(path: Path) -> PoseTrack:
     table = np.array(rows)
     norm = np.sqrt((table[:, 3:] ** 2).sum(axis=1))
     quaternions = table[:, 3:] / norm[:, None]
+    _refuse_speed(path, np.array(stamps, np.int64), table[:, :3])
     rotations = rotations_of(quaternions)
     _refuse_w_first(path, rotations, rotations_of(np.roll(quaternions, -1, axis=1)))
     return PoseTrack(np.array(stamps, np.int64), rotations, table[:, :3], path.name)
+
+
+def _refuse_speed(path: Path, stamp_ns: I64Array, position_m: F64Array) -> None:
+    """RigError for a vehicle that is faster than any: positions in mm, or times of another unit."""
+    step_m = np.sqrt((np.diff(position_m, axis=0) ** 2).sum(axis=1))
+    speed = float(np.median(step_m / (np.diff(stamp_ns) / NS_PER_S)))
+    if speed > _MOST_SPEED:
+        raise RigError(
+            f"{path}: expected positions in m of a vehicle below {_MOST_SPEED:g} m/s, found a "
+            f"median of {speed:.4g} m/s; convert millimetres to metres, and times to s"
+        )
 
 
 def _refuse_w_first(path: Path, rotations: F64Array, others: F64Array) -> None:

@@ -121,6 +121,9 @@ def read_identity(path: Path) -> dict[str, str]:
     identity = content.get("identity") if isinstance(content, dict) else None
     if not isinstance(identity, dict):
         return {}
+    shard = content.get("shard")
+    if isinstance(shard, dict):
+        identity |= {"shard": f"{shard.get('number')}/{shard.get('count')}"}
     return {str(key): str(text) for key, text in identity.items()}
 
 

@@ -121,3 +121,19 @@ def test_w_last_is_read(first: float, last: float, roll: float, tmp_path: Path) 
 def test_a_missing_file_is_one_line(tmp_path: Path) -> None:
     with pytest.raises(RigError, match="expected a trajectory"):
         read_tum(tmp_path / "none.tum")
+
+
+def test_positions_in_millimetres_are_refused(tmp_path: Path) -> None:
+    """10 m/s are 10,000 in millimetres."""
+    path = tmp_path / "drive.tum"
+    lines = (f"{1 + i / 10} {{}} 0 0 0 0 0 1" for i in range(20))
+    text = "\n".join(lines)
+    path.write_text(text.format(*(float(i) for i in range(20))))
+    assert read_tum(path).position_m[-1, 0] == 19.0
+    path.write_text(text.format(*(1000.0 * i for i in range(20))))
+    with pytest.raises(RigError) as caught:
+        read_tum(path)
+    assert str(caught.value) == (
+        f"{path}: expected positions in m of a vehicle below 200 m/s, found a median of 1e+04 m/s; "
+        "convert millimetres to metres, and times to s"
+    )

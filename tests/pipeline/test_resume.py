@@ -314,6 +314,14 @@ def test_a_complete_output_of_another_job_is_refused(
     )
 
 
+def test_another_shard_is_refused(shell: Shell) -> None:
+    words = f"{CAPTURE} -o out --format npz --resume --shard"
+    assert shell(f"convert {words} 1/2").code == 0
+    refused = shell(f"convert {words} 2/2")
+    assert (refused.code, "found shard '2/2' instead of '1/2'" in refused.err) == (2, True)
+    assert "is complete" in shell(f"convert {words} 1/2").err
+
+
 def test_copies_and_other_versions_make_the_same_output(
     shell: Shell, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

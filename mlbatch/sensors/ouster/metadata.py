@@ -104,8 +104,15 @@ class Document(NamedTuple):
         """As `pose`, millimetres in the file, metres here; most_m: longest translation."""
         pose = self.pose(key, most_m * MM_PER_M, "mm")
         if pose is not None:
+            self.refuse_metres(key, float(np.linalg.norm(pose[:3, 3])))
             pose[:3, 3] *= M_PER_MM
         return pose
+
+    def refuse_metres(self, key: str, length_mm: float) -> None:
+        """Refuse a length of less than 1 mm that is not 0: no part is so near another."""
+        if 0 < abs(length_mm) < 1:
+            found = f"{length_mm:.4g} mm, {length_mm * MM_PER_M:.4g} mm if the file has metres"
+            self.fail(key, "millimetres", found)
 
     def pose(self, key: str, most: float, unit: str) -> F64Array | None:
         """A rigid (4, 4) transform; None if absent. most: longest plausible translation."""
@@ -179,6 +186,8 @@ def _is_ouster(top: dict[str, object]) -> bool:
 # Beams are listed from the top; calibrated neighbours may be out of order by less than this.
 _RISE_DEG = 0.5
 # Largest angles of beams.
+# The narrowest field of any Ouster is 22.5 degrees (OS2).
+_LEAST_FIELD_DEG = 5.0
 _ANGLES_DEG = {"beam_altitude_angles": 90.0, "beam_azimuth_angles": 360.0}
 _DEFAULT_LIDAR_PORT = 7502
 _DEFAULT_IMU_PORT = 7503
@@ -306,6 +315,13 @@ def _angles_deg(document: Document) -> tuple[F64Array, F64Array]:
             "angles that fall from the top beam to the lowest",
             f"{altitude_deg[0]:g} to {altitude_deg[-1]:g} degrees, as if their sign were turned",
         )
+    field_deg = float(altitude_deg[0] - altitude_deg[-1])
+    if 0 < field_deg < _LEAST_FIELD_DEG <= field_deg / RAD_PER_DEG:
+        document.fail(
+            "beam_altitude_angles",
+            f"degrees, over a field of {_LEAST_FIELD_DEG:g} or more",
+            f"{altitude_deg[0]:g} to {altitude_deg[-1]:g}, as if they were radians",
+        )
     return altitude_deg, azimuth_deg
 
 
@@ -375,6 +391,8 @@ def _serial(document: Document) -> int:
 def _beam_offset_m(document: Document) -> tuple[float, float]:
     beam_to_lidar_mm = document.pose("beam_to_lidar_transform", MAX_ORIGIN_M * MM_PER_M, "mm")
     if beam_to_lidar_mm is not None:
+        away_mm = math.hypot(beam_to_lidar_mm[0, 3], beam_to_lidar_mm[2, 3])
+        document.refuse_metres("beam_to_lidar_transform", away_mm)
         return float(beam_to_lidar_mm[0, 3]) / MM_PER_M, float(beam_to_lidar_mm[2, 3]) / MM_PER_M
     key = "lidar_origin_to_beam_origin_mm"
     offset_mm = document.number(key)
@@ -382,6 +400,7 @@ def _beam_offset_m(document: Document) -> tuple[float, float]:
         offset_mm = _default_offset_mm(document)
     if abs(offset_mm) > MAX_ORIGIN_M * MM_PER_M:
         document.fail(key, f"at most {MAX_ORIGIN_M * MM_PER_M:g} mm", f"{offset_mm:g} mm")
+    document.refuse_metres(key, offset_mm)
     return offset_mm / MM_PER_M, 0.0
 
 

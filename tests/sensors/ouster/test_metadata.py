@@ -283,6 +283,23 @@ MISTAKES: list[tuple[tuple[str, ...], object, str]] = [
         "beam_altitude_angles: expected angles that fall .*, found -16 to 16 degrees, as if their "
         "sign were turned",
     ),
+    (
+        BEAMS,
+        np.radians(np.linspace(16.0, -16.0, 64)).tolist(),
+        "beam_altitude_angles: expected degrees, over a field of 5 or more, found 0.279253 to "
+        "-0.279253, as if they were radians",
+    ),
+    (
+        LIDAR_TO_SENSOR,
+        _moved(0.03618),
+        "lidar_to_sensor_transform: expected millimetres, found 0.03618 mm, 36.18 mm if the file "
+        "has metres",
+    ),
+    (
+        BEAM_TO_LIDAR,
+        _moved(0.015806),
+        "beam_to_lidar_transform: expected millimetres, found 0.01581 mm, 15.81 mm if",
+    ),
     (BEAMS, [[1.0] * 64] * 4, "beam_altitude_angles: .*a unit that does not spin"),
     (AZIMUTHS, [1.0] * 63, "beam_azimuth_angles: expected 64 angles in degrees, found 63 entries"),
     (AZIMUTHS, None, "beam_azimuth_angles: expected 64 angles in degrees, found nothing"),
