@@ -188,8 +188,6 @@ class Recording:
     last_ns: int | None = field(default=None, kw_only=True)
     # Part of `size_bytes` that the current pass has read.
     position_bytes: int = field(default=0, kw_only=True)
-    # Ignored by containers that have one implementation.
-    engine: str = field(default="native", kw_only=True)
 
     def packets(self) -> Generator[PacketBatch, None, None]:
         """Yield all packets from the start, in file order; each call is a new pass.
@@ -215,10 +213,6 @@ class Recording:
 
         earlier: was read to its end; this one: at least its first packets were read.
         """
-
-    def use_engine(self, engine: str) -> None:
-        """Read by `numpy` or `native` from the next pass on."""
-        self.engine = engine
 
     def use_arena(self, arena: PacketArena) -> bool:
         """Read the next pass into an arena; False for containers that cannot."""
@@ -250,10 +244,6 @@ class WrappedRecording(Recording):
     def follow(self, earlier: Recording) -> None:
         """Pass on what both wrap."""
         self.inner.follow(earlier.inner if isinstance(earlier, WrappedRecording) else earlier)
-
-    def use_engine(self, engine: str) -> None:
-        """Pass the engine on."""
-        self.inner.use_engine(engine)
 
     def use_arena(self, arena: PacketArena) -> bool:
         """Not passed on, since packets change; see `Recording`."""

@@ -227,9 +227,6 @@ def test_a_wrapped_recording_reports_what_its_inner_one_does(tmp_path: Path) -> 
     path.write_bytes(CONTENT)
     inner = open_capture(path)
     outer = WrappedRecording(inner)
-    outer.use_engine("native")
-    assert inner.engine == "native"
-    inner.use_engine("numpy")
     read(inner)
     assert (outer.path, outer.container, outer.notes) == (inner.path, "pcap", [])
     assert outer.counts is inner.counts

@@ -143,7 +143,6 @@ def test_a_search_for_sensors_packs_first_points_and_the_run_all(tmp_path: Path)
     points = [(1, 1, ring, 9, 1000 * column, ring) for column in range(256) for ring in range(16)]
     clouds = [cloud_message(OUSTER, points, STAMP_NS + n * 100_000_000) for n in range(3)]
     recording, _ = _open(_bag(tmp_path, write_points("/points", clouds)))
-    recording.use_engine("native")
     recording.clouds.first_points_only = True
     # The first cloud decides the layout.
     searched = _payloads(recording.packets())
@@ -162,7 +161,6 @@ def test_clouds_without_a_place_at_first_are_searched_whole(tmp_path: Path) -> N
     ]
     clouds = [cloud_message(OUSTER, points, STAMP_NS + n * 100_000_000) for n in range(2)]
     recording, _ = _open(_bag(tmp_path, write_points("/points", clouds)))
-    recording.use_engine("native")
     recording.clouds.first_points_only = True
     assert len(_payloads(recording.packets())) == 2 * 256
 
