@@ -147,7 +147,7 @@ def _run_one(job: Job, target: Target) -> list[str]:
     with progress_bar(*stages, is_shown=shown, is_verbose=target.verbose) as progress:
         last = None if files is None else _last(target, report_path, name, options, files)
         conversion, inputs = _converted(job, open_output, progress, files, last)
-    inputs = inputs._replace(command=_command())
+    inputs = _of_job(inputs, files)
     for note in conversion.notes:
         say(f"warning: {note.code}: {note.message}")
     if job.shard is not None and files is not None:
@@ -257,9 +257,7 @@ def _last(
     """
 
     def write(inputs: RunReport, partial: Path) -> None:
-        from mlbatch.pipeline.job_identity import identity_of_parts
-
-        inputs = inputs._replace(command=_command())
+        inputs = _of_job(inputs, files)
         if files.is_shard:
             from mlbatch.pipeline.shards import write_account
 
@@ -267,7 +265,6 @@ def _last(
             return
         if report_path is None or target.output is None:
             return
-        inputs = inputs._replace(identity=identity_of_parts(files.identity))
         is_inside = report_path.parent.absolute() == target.output.absolute()
         path = partial / report_path.name if is_inside else report_path
         write_text(path, report_text(inputs), target.fsync)
@@ -275,6 +272,16 @@ def _last(
             sync_entries(path.parent)
 
     return write
+
+
+def _of_job(inputs: RunReport, files: Files | None) -> RunReport:
+    """The report with the command line and, of an output, what made it."""
+    inputs = inputs._replace(command=_command())
+    if files is None or files.is_shard:
+        return inputs
+    from mlbatch.pipeline.job_identity import identity_of_parts
+
+    return inputs._replace(identity=identity_of_parts(files.identity))
 
 
 def _command() -> str:

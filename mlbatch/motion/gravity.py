@@ -26,7 +26,7 @@ MOST_TILT_DEG = 30.0
 def mean_gravity(parts: Sequence[ImuSamples]) -> F64Array | None:
     """Mean specific force (3,), m/s2, IMU frame, of samples; None if that is not gravity alone."""
     stamp_ns = np.concatenate([part.stamp_ns for part in parts])
-    if len(stamp_ns) < LEAST_SAMPLES or int(stamp_ns.max() - stamp_ns.min()) < STANDSTILL_NS:
+    if len(stamp_ns) < LEAST_SAMPLES or int(stamp_ns.max()) - int(stamp_ns.min()) < STANDSTILL_NS:
         return None
     force: F64Array = np.concatenate([part.acceleration for part in parts]).mean(axis=0)
     rate = np.concatenate([part.angular_velocity for part in parts]).mean(axis=0)

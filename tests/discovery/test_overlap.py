@@ -64,7 +64,9 @@ def test_different_lidars_at_different_times_are_refused(
     left = pack(_capture(tmp_path / "left.pcap", ONE.records, [ONE]))
     right = pack(_capture(tmp_path / "right.pcap", LATER.records, [LATER]))
     for jobs in ("1", "3"):
-        done = shell("convert", *[left, right][::order], "-o", "out", IDENTITY, "--jobs", jobs)
+        done = shell(
+            "convert", *[left, right][::order], "-o", f"out{jobs}", IDENTITY, "--jobs", jobs
+        )
         assert (done.code, done.out) == (1, "")
         assert done.err == (
             f"mlbatch: error: {left} ({FIRST}), {right} ({SECOND}): expected recordings of "
@@ -72,7 +74,7 @@ def test_different_lidars_at_different_times_are_refused(
             "has all lidars; convert each alone, or correct the receive times (editcap -t "
             "SECONDS) (no_overlap)\n"
         )
-        assert not Path("out").exists()
+        assert not Path(f"out{jobs}").exists()
     assert "no_overlap" in shell("compare", left, right).err
 
 

@@ -76,9 +76,11 @@ def test_other_values_in_a_sound_file_are_found(
         CHANGES[change](found.scan)
         return found
 
-    def as_before(run: Conversion, scan: Scan, checksum: int | None = None) -> None:
+    def as_before(
+        run: Conversion, scan: Scan, checksum: int | None = None, is_listed: bool = True
+    ) -> None:
         key = (scan.index, scan.slice)
-        account(run, scan, 0 if key in seen else next(sums))
+        account(run, scan, 0 if key in seen else next(sums), is_listed)
         seen.add(key)
 
     # Without the layout of records, so that scans have arrays.
