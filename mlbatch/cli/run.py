@@ -457,6 +457,9 @@ def _difference_of_output(
     """
     from mlbatch.pipeline.job_identity import difference_of_outputs, identity_of, read_identity
 
+    is_shard = (output / SHARD_JSON).is_file()
+    if is_shard != (job.shard is not None):
+        return f"a shard ({SHARD_JSON})" if is_shard else "all of its scans, not those of a shard"
     report = target.report or report_paths(output, name).report
     identity = read_identity(report if job.shard is None else output / SHARD_JSON)
     own = {} if job.shard is None else {"shard": str(job.shard)}

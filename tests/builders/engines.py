@@ -22,7 +22,6 @@ from tests.reference.decoder import LiteralDecoder, check_scan
 needs_native = pytest.mark.skipif(
     bool(trouble()), reason="the compiled library is missing: install mlbatch"
 )
-ENGINES = ("numpy", "native")
 # Layers of space, in which every sensor has some points.
 BOXES_M = ((-90.0, -90.0, -90.0, 90.0, 90.0, 0.0), (-90.0, -90.0, 0.3, 90.0, 90.0, 1.5))
 _CUT = Job((), min_range_m=2.0, max_range_m=5.0, boxes_m=BOXES_M)

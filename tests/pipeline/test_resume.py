@@ -322,6 +322,21 @@ def test_another_shard_is_refused(shell: Shell) -> None:
     assert "is complete" in shell(f"convert {words} 1/2").err
 
 
+@pytest.mark.parametrize(
+    ("first", "second", "found"),
+    [
+        ("", "--shard 1/2", "all of its scans, not those of a shard"),
+        ("--shard 1/2", "", "a shard (shard.json)"),
+    ],
+)
+def test_a_shard_is_no_whole_output(shell: Shell, first: str, second: str, found: str) -> None:
+    words = f"{CAPTURE} -o out --format npz --resume"
+    assert shell(f"convert {words} {first}").code == 0
+    refused = shell(f"convert {words} {second}")
+    assert (refused.code, f"for --resume, found {found}; " in refused.err) == (2, True)
+    assert "is complete" in shell(f"convert {words} {first}").err
+
+
 def test_copies_and_other_versions_make_the_same_output(
     shell: Shell, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
