@@ -73,7 +73,7 @@ docs: $(VENV)/docs.stamp
 
 bench: $(VENV)/dev.stamp
 	$(BIN)/python -m pytest -m slow
-	$(BIN)/mlbatch bench $(BENCH)
+	$(BIN)/python -m tests.bench $(BENCH)
 
 odometry: $(ODOMETRY)/odometry.stamp
 	$(ODOMETRY)/bin/python examples/odometry/odometry.py $(STUDY)

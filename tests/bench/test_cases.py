@@ -6,9 +6,9 @@ from pathlib import Path
 
 import pytest
 
-from mlbatch.bench import cases
-from mlbatch.bench.cases import CAPTURE, CASES, KINDS, RECORDINGS, disk_bytes, is_current
-from mlbatch.bench.recordings import make
+from tests.bench import cases
+from tests.bench.cases import CAPTURE, CASES, KINDS, RECORDINGS, disk_bytes, is_current
+from tests.bench.recordings import make
 
 
 def test_names_are_unique() -> None:

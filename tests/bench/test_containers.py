@@ -6,9 +6,9 @@ from pathlib import Path
 
 import pytest
 
-from mlbatch.bench.cases import CAPTURE, RECORDINGS
-from mlbatch.bench.recordings import make
 from tests.bench import containers
+from tests.bench.cases import CAPTURE, RECORDINGS
+from tests.bench.recordings import make
 
 pytestmark = pytest.mark.slow
 

@@ -7,9 +7,9 @@ from pathlib import Path
 
 import pytest
 
-from mlbatch.bench.cases import CAPTURE, RECORDINGS, RIG
-from mlbatch.bench.recordings import make
 from tests.bench import latency
+from tests.bench.cases import CAPTURE, RECORDINGS, RIG
+from tests.bench.recordings import make
 
 pytestmark = pytest.mark.slow
 

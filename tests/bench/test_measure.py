@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from mlbatch.bench.measure import BenchError, Usage, cpu_model, measure, vector_flags
+from tests.bench.measure import BenchError, Usage, cpu_model, measure, vector_flags
 from tests.contract.tree import run_python
 
 # Run in a small process: pages of the measuring process count, too.
@@ -16,7 +16,7 @@ MEASURED = """
 import json, sys
 from dataclasses import asdict
 from pathlib import Path
-from mlbatch.bench.measure import measure
+from tests.bench.measure import measure
 codes = {
     "idle": "import time; time.sleep(0.3)",
     "busy": "import time\\nwhile time.process_time() < 0.5: pass",
@@ -39,8 +39,8 @@ def test_cpu_memory_and_time_are_those_of_the_process(tmp_path: Path) -> None:
 def test_the_measuring_process_imports_no_large_package() -> None:
     """Its pages count in the memory of measured processes."""
     loaded = run_python(
-        "import sys\nimport mlbatch.cli.bench as bench\n"
-        "bench.settings_from(1.0, 1, [], [], None, None)\n"
+        "import sys\nimport tests.bench.__main__ as bench\n"
+        "bench.settings_from(bench.parser().parse_args([]))\n"
         "print([name for name in ('numpy', 'mcap', 'yaml') if name in sys.modules])"
     )
     assert loaded.strip() == "[]"

@@ -7,11 +7,11 @@ from pathlib import Path
 
 import pytest
 
-from mlbatch.bench.cases import RECORDINGS
-from mlbatch.bench.measure import BenchError
-from mlbatch.bench.peers import PEERS, installed, run_peer
-from mlbatch.bench.recordings import make
-from mlbatch.bench.results import Workload
+from tests.bench.cases import RECORDINGS
+from tests.bench.measure import BenchError
+from tests.bench.peers import PEERS, installed, run_peer
+from tests.bench.recordings import make
+from tests.bench.results import Workload
 
 VLP16 = RECORDINGS["three-vlp16"]
 DUAL = RECORDINGS["dual-4"]

@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 from mcap.reader import make_reader
 
-from mlbatch.bench import programs
-from mlbatch.bench.measure import measure
+from tests.bench import programs
+from tests.bench.measure import measure
 
 
 def test_the_write_floor_writes_as_many_bytes(
@@ -39,6 +39,6 @@ def test_the_library_writes_as_many_messages(
 @pytest.mark.parametrize("name", programs.FLOORS)
 def test_floors_run_in_processes(tmp_path: Path, name: str) -> None:
     result = tmp_path / "times.json"
-    command = [sys.executable, "-m", "mlbatch.bench.programs", name, str(result), "1000000", "0"]
+    command = [sys.executable, "-m", "tests.bench.programs", name, str(result), "1000000", "0"]
     assert measure(name, command, tmp_path).wall_s > 0
     assert json.loads(result.read_text())["wall_s"] > 0

@@ -16,9 +16,9 @@ import dpkt
 import pytest
 from mcap.reader import make_reader
 
-from mlbatch.bench import recordings
-from mlbatch.bench.cases import CAPTURE, RECORDINGS, RIG
-from mlbatch.bench.recordings import make
+from tests.bench import recordings
+from tests.bench.cases import CAPTURE, RECORDINGS, RIG
+from tests.bench.recordings import make
 from tests.builders.run import command
 
 SECONDS = 1.0

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from mlbatch.bench.measure import BenchError
-from mlbatch.bench.results import (
+from tests.bench.measure import BenchError
+from tests.bench.results import (
     COPY,
     CPU,
     DRY_RUN,
@@ -187,8 +187,8 @@ def test_an_earlier_document_is_read_back(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("", "expected the output of `mlbatch bench --json`"),
-        ("[]", "expected the output of `mlbatch bench --json`"),
+        ("", "expected the output of `python -m tests.bench --json`"),
+        ("[]", "expected the output of `python -m tests.bench --json`"),
         ("{}", "KeyError"),
         (
             '{"schema": "mlbatch.bench/9", "rows": []}',

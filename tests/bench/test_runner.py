@@ -6,9 +6,9 @@ from pathlib import Path
 
 import pytest
 
-from mlbatch.bench import runner
-from mlbatch.bench.cases import Case, Conversion
-from mlbatch.bench.results import Run, Workload
+from tests.bench import runner
+from tests.bench.cases import Case, Conversion
+from tests.bench.results import Run, Workload
 
 
 def test_programs_alternate_in_both_directions(

@@ -34,7 +34,7 @@ def test_no_other_path_may_be_it(
     shell: Shell, tmp_path: Path, command: str, option: str, is_argument: bool
 ) -> None:
     words = ["-"] if is_argument else [option, "-"]
-    if not is_argument and command != "bench":
+    if not is_argument:
         words.append(str(CAPTURE))
     if command == "diff":
         words = ["-", str(CAPTURE)] if option == "a" else [str(CAPTURE), "-"]
@@ -53,7 +53,6 @@ def test_no_other_path_may_be_it(
 def test_paths_of_all_commands_are_tested() -> None:
     assert {command for command, _, _ in _paths()} >= {"convert", "inspect", "compare", "verify"}
     assert ("convert", "--output", False) in _paths()
-    assert ("bench", "--keep", False) in _paths()
 
 
 @pytest.mark.parametrize("jobs", ["1", "3"])

@@ -21,6 +21,7 @@ import yaml
 from typer.main import get_command
 
 from mlbatch.cli.app import COMMANDS, command_line
+from tests.bench.__main__ import parser as bench_options
 from tests.contract.blocks import LANGUAGES, PAGES, Block, blocks, calls
 from tests.contract.test_help import OPTIONS
 from tests.contract.tree import ROOT
@@ -147,7 +148,7 @@ def test_blocks_that_do_not_run_have_options_that_exist(block: Block) -> None:
             assert targets <= MAKE_TARGETS, f"{block.place}: {command.line}"
             for word in words:
                 if word.startswith("BENCH="):
-                    _parse(["bench", *shlex.split(word.removeprefix("BENCH="))])
+                    bench_options().parse_args(shlex.split(word.removeprefix("BENCH=")))
 
 
 def _parse(arguments: list[str]) -> None:
@@ -168,6 +169,9 @@ FOREIGN_OPTIONS = {"--count", "--decimate", "--help", "--number", "--output-dir"
     "--target",
     "--version",
     "--install-completion",
+    # tests.bench.
+    "--keep",
+    "--seconds",
     # examples/odometry and evo.
     "--t_offset",
     "--truth",

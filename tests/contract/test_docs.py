@@ -13,7 +13,6 @@ import pytest
 import yaml
 
 from mlbatch import writers
-from mlbatch.bench.cases import CASES, RECORDINGS, disk_bytes
 from mlbatch.discovery import sampler
 from mlbatch.discovery.discover import SensorSelection
 from mlbatch.discovery.probe import MAX_CALIBRATION_FILE_BYTES
@@ -32,6 +31,7 @@ from mlbatch.rig import yaml_tree
 from mlbatch.sensors import MAX_CALIBRATION_BYTES, models
 from mlbatch.writers import format_names, formats
 from mlbatch.writers.point_layouts import CLOUD_LAYOUTS, PLY_LAYOUT
+from tests.bench.cases import CASES, RECORDINGS, disk_bytes
 from tests.consumers.environments import ENVIRONMENTS
 from tests.contract.blocks import PAGES
 from tests.contract.test_help import OPTIONS
@@ -213,12 +213,12 @@ def test_the_page_of_options_has_every_option() -> None:
 
 
 def test_the_figures_of_performance_have_cases_that_print_them() -> None:
-    """The cases of the table are those of `mlbatch bench`, the recordings as well."""
+    """The cases of the table are those of the benchmark, the recordings as well."""
     page = _page("performance.md")
     again = page.partition("\n## Measure again\n")[2].partition("\n## ")[0]
     named = {word for row in _rows(again) for word in re.split(r"[ ,()]+", row[0])}
     assert {case.name for case in CASES} - named <= {"pandar64", "mixed", "mixed-mcap"}
-    # Upper limits, as `mlbatch bench` asks for them.
+    # Upper limits, as it asks for them.
     gigabytes = dict(re.findall(r"(12 s need|else running and) (\d+) GB of free disk", page))
     assert int(gigabytes["12 s need"]) == math.ceil(disk_bytes(CASES, 12) / 1e9)
     assert int(gigabytes["else running and"]) >= disk_bytes(CASES, 60) / 1e9

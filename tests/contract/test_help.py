@@ -136,15 +136,6 @@ OPTIONS: dict[str, dict[str, str]] = {
         "--overwrite": "existing",
     },
     "diff": {"--tolerance": r"\bm\b", "--json": "JSON"},
-    "bench": {
-        "--seconds": r"\bs\b",
-        "--repeat": "program",
-        "--case": "repeatable",
-        "--peer-python": "ouster-sdk or velodyne-decoder.*repeatable",
-        "--keep": "recordings",
-        "--against": "Earlier.*JSON",
-        "--json": "JSON",
-    },
 }
 # Options of `convert` that a batch passes on; the others are its own, or have no meaning there.
 _OWN = ("--output", "--rig", "--jobs", "--overwrite", "--resume", "--quiet", "--verbose")

@@ -13,7 +13,7 @@ FLOORS: tuple[tuple[str, ...], ...] = (
     ("__main__",),
     ("cli",),
     ("batch",),
-    ("api", "compare", "bench", "simulate"),
+    ("api", "compare", "simulate"),
     ("page",),
     ("python", "digest"),
     ("pipeline",),

@@ -104,9 +104,7 @@ def test_the_package_needs_exactly_what_it_imports() -> None:
     extras = _settings("project", "optional-dependencies")
     lists = [cast(list[str], names) for extra, names in extras.items() if extra != "dev"]
     optional = {name for one in lists for name in _modules_of(one)}
-    # The programs of peers run in an interpreter of their own, with what the peer brings.
-    own = [module for module in modules() if module.name != "bench.programs"]
-    found = {_top(node) for module in own for node in ast.walk(module.tree)} - {""}
+    found = {_top(node) for module in modules() for node in ast.walk(module.tree)} - {""}
     # Only the type checker imports it, which brings it.
     foreign = found - set(sys.stdlib_module_names) - {"mlbatch", "typing_extensions"}
     assert needed <= foreign <= needed | optional

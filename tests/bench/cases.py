@@ -12,8 +12,8 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Final
 
-from mlbatch.bench.results import COPY, DRY_RUN, LIBRARY, START, WRITE
 from mlbatch.units import NS_PER_MS
+from tests.bench.results import COPY, DRY_RUN, LIBRARY, START, WRITE
 
 # -- recordings -----------------------------------------------------------------------------------
 

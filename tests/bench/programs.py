@@ -1,6 +1,6 @@
 """Programs that are measured for comparison, each in a process of its own: floors and peers.
 
-    python -m mlbatch.bench.programs FLOOR RESULT BYTES MESSAGES
+    python -m tests.bench.programs FLOOR RESULT BYTES MESSAGES
 
 runs a floor: work that no conversion avoids (`copy`, `write`, `start`), or a library (`mcap`). A
 peer is another program that does a part of the same work; peers.py passes this file as text to

@@ -19,10 +19,10 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from mlbatch.bench.cases import BY_RING, CLOUD_COLUMNS, CLOUD_RINGS, BenchSensor
-from mlbatch.bench.scene import EPOCH_NS, REVOLUTION_NS, scene
 from mlbatch.ros.definitions import definition
 from mlbatch.units import NS_PER_MS, NS_PER_S
+from tests.bench.cases import BY_RING, CLOUD_COLUMNS, CLOUD_RINGS, BenchSensor
+from tests.bench.scene import EPOCH_NS, REVOLUTION_NS, scene
 
 _TYPE: Final = "sensor_msgs/PointCloud2"
 _POINT: Final = np.dtype(

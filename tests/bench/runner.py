@@ -14,10 +14,10 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Final
 
-from mlbatch.bench.cases import RECORDINGS, RIG, Case, Conversion, disk_bytes, is_current
-from mlbatch.bench.measure import BYTES_PER_MB, BenchError, machine, measure
-from mlbatch.bench.peers import PEERS, Peer, installed, run_peer
-from mlbatch.bench.results import (
+from tests.bench.cases import RECORDINGS, RIG, Case, Conversion, disk_bytes, is_current
+from tests.bench.measure import BYTES_PER_MB, BenchError, machine, measure
+from tests.bench.peers import PEERS, Peer, installed, run_peer
+from tests.bench.results import (
     COPY,
     FLOOR,
     LIBRARY,
@@ -200,7 +200,7 @@ class BenchSession:
         if not is_current(folder, RECORDINGS[name]):
             folder.mkdir(exist_ok=True)
             self.settings.progress(f"making {name}")
-            module = [sys.executable, "-m", "mlbatch.bench.recordings"]
+            module = [sys.executable, "-m", "tests.bench.recordings"]
             seconds = str(self.settings.seconds)
             measure(f"recording {name}", [*module, name, seconds, str(folder)], self.scratch)
         return folder
@@ -243,7 +243,7 @@ class BenchSession:
         if name == COPY:
             size = done.read_bytes + (size or done.points * _POINT_BYTES)
         result = self.scratch / "floor.json"
-        command = [sys.executable, "-m", "mlbatch.bench.programs", _FLOORS[name], str(result)]
+        command = [sys.executable, "-m", "tests.bench.programs", _FLOORS[name], str(result)]
         usage = measure(name, [*command, str(size), str(done.scans)], self.scratch)
         _delete_outputs(self.scratch)
         found = json.loads(result.read_text(encoding="utf-8"))

@@ -1,19 +1,42 @@
-"""The command `mlbatch bench`."""
+"""The command line of the benchmark."""
 
 from __future__ import annotations
 
+import contextlib
+import io
 import json
 import shutil
 from collections import namedtuple
 from pathlib import Path
+from typing import NamedTuple
 
 import pytest
 
-from mlbatch.bench.cases import Case, Conversion
-from mlbatch.cli import bench as options
-from tests.builders.run import command
+from tests.bench.__main__ import main, parser, settings_from
+from tests.bench.cases import Case, Conversion
 
-SHORT = ("bench", "--seconds", "1", "--repeat", "1", "--case", "three-vlp16")
+SHORT = ("--seconds", "1", "--repeat", "1", "--case", "three-vlp16")
+
+
+class Output(NamedTuple):
+    """Output of a benchmark, and its exit code."""
+
+    code: int
+    out: str
+    err: str
+
+
+def command(*words: str | Path) -> Output:
+    """Run it with these words in this process."""
+    out = io.StringIO()
+    err = io.StringIO()
+    code: object = 0
+    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+        try:
+            main([str(word) for word in words])
+        except SystemExit as leave:
+            code = leave.code
+    return Output(int(str(code)), out.getvalue(), err.getvalue())
 
 
 def test_a_short_run_and_another_against_it(tmp_path: Path) -> None:
@@ -47,8 +70,8 @@ def test_a_short_run_and_another_against_it(tmp_path: Path) -> None:
 
 def test_outputs_are_measured_and_deleted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     case = Case("small", ("three-vlp16",), "mcap", ("plain write", "mcap library"))
-    monkeypatch.setattr("mlbatch.bench.cases.CASES", (case,))
-    done = command("bench", "--seconds", "1", "--repeat", "2", "--json", "--keep", tmp_path)
+    monkeypatch.setattr("tests.bench.__main__.CASES", (case,))
+    done = command("--seconds", "1", "--repeat", "2", "--json", "--keep", tmp_path)
     assert done.code == 0
     found = json.loads(done.out)
     rows = {row["program"]: row for row in found["rows"]}
@@ -64,12 +87,12 @@ def test_a_failed_conversion_is_reported_at_the_end(
 ) -> None:
     wrong = Conversion("wrong", "three-vlp16", options=("--rate", "0.01"))
     case = Case("small", ("three-vlp16",), "", (), (Conversion("right", "three-vlp16"), wrong))
-    monkeypatch.setattr("mlbatch.bench.cases.CASES", (case,))
-    done = command("bench", "--seconds", "1", "--repeat", "1", "--keep", tmp_path)
+    monkeypatch.setattr("tests.bench.__main__.CASES", (case,))
+    done = command("--seconds", "1", "--repeat", "1", "--keep", tmp_path)
     assert done.code == 1
     assert "small  right" in done.out
     assert "note: small: wrong: expected exit code 0, found 2: mlbatch: error: --rate" in done.out
-    assert done.err.startswith("mlbatch: error: 1 conversion(s) failed, small: wrong first")
+    assert done.err.startswith("bench: error: 1 conversion(s) failed, small: wrong first")
 
 
 @pytest.mark.parametrize(
@@ -85,16 +108,16 @@ def test_a_failed_conversion_is_reported_at_the_end(
     ],
 )
 def test_mistakes(words: tuple[str, ...], code: int, message: str) -> None:
-    done = command("bench", *words)
+    done = command(*words)
     assert done.code == code
-    assert done.err.startswith(f"mlbatch: error: {message}")
+    assert done.err.startswith(f"bench: error: {message}")
     assert done.err.count("\n") == 1
 
 
 def test_a_full_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     usage = namedtuple("usage", ["total", "used", "free"])
     monkeypatch.setattr(shutil, "disk_usage", lambda path: usage(2, 1, 5_000_000))
-    done = command("bench", "--case", "pandar64", "--seconds", "10", "--keep", tmp_path)
+    done = command("--case", "pandar64", "--seconds", "10", "--keep", tmp_path)
     assert done.code == 1
     # 3000 packets of 1198 bytes and 58 around them, in 10 s.
     assert "expected about 37 MB of free disk, found 5 MB; choose another with --keep" in done.err
@@ -103,6 +126,6 @@ def test_a_full_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_a_case_that_is_named_twice_is_measured_once() -> None:
     """Otherwise its rows would be compared with each other."""
-    names = ["pandar64", "mixed", "pandar64"]
-    settings = options.settings_from(1.0, 1, names, [], None, None)
+    names = ["--case", "pandar64", "--case", "mixed", "--case", "pandar64"]
+    settings = settings_from(parser().parse_args(names))
     assert [case.name for case in settings.cases] == ["pandar64", "mixed"]

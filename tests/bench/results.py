@@ -9,9 +9,9 @@ from pathlib import Path
 from statistics import median
 from typing import Final, TypeAlias
 
-from mlbatch.bench.measure import BenchError
 from mlbatch.errors import one_line
 from mlbatch.units import NS_PER_S
+from tests.bench.measure import BenchError
 
 Json: TypeAlias = bool | int | float | str | Sequence["Json"] | Mapping[str, "Json"] | None
 
@@ -260,7 +260,7 @@ def read_document(path: Path) -> dict[tuple[str, str], dict[str, list[float]]]:
         ) from err
     except (ValueError, KeyError, TypeError) as err:
         raise BenchError(
-            f"{path}: expected the output of `mlbatch bench --json`, found something else "
+            f"{path}: expected the output of `python -m tests.bench --json`, found something else "
             f"({type(err).__name__}: {err}); give another file"
         ) from err
 

@@ -2,7 +2,7 @@
 
 Recordings of decoded clouds are MCAP files, made by clouds.py.
 
-    python -m mlbatch.bench.recordings dual-4 12 FOLDER
+    python -m tests.bench.recordings dual-4 12 FOLDER
 
 It runs in a process of its own, so that the measuring process does not import numpy. The packets
 of one revolution are encoded once; later packets repeat its pixels with their own timestamps,
@@ -32,7 +32,9 @@ import numpy as np
 import numpy.typing as npt
 
 from mlbatch.arrays import I64Array, U8Array
-from mlbatch.bench.cases import (
+from mlbatch.types import Stream
+from mlbatch.units import NS_PER_MS, NS_PER_S, NS_PER_US
+from tests.bench.cases import (
     DIGEST,
     FULL,
     KINDS,
@@ -46,10 +48,8 @@ from mlbatch.bench.cases import (
     BenchSensor,
     digest,
 )
-from mlbatch.bench.clouds import write_clouds
-from mlbatch.bench.scene import EPOCH_NS, REVOLUTION_NS, scene
-from mlbatch.types import Stream
-from mlbatch.units import NS_PER_MS, NS_PER_S, NS_PER_US
+from tests.bench.clouds import write_clouds
+from tests.bench.scene import EPOCH_NS, REVOLUTION_NS, scene
 
 # -- packets --------------------------------------------------------------------------------------
 

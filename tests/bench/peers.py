@@ -8,9 +8,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-from mlbatch.bench.cases import CAPTURE, FULL, LOW, VLP16, VLS128, BenchRecording
-from mlbatch.bench.measure import BenchError, measure
-from mlbatch.bench.results import Run, Workload
+from tests.bench.cases import CAPTURE, FULL, LOW, VLP16, VLS128, BenchRecording
+from tests.bench.measure import BenchError, measure
+from tests.bench.results import Run, Workload
 
 _VERSIONS: Final = """
 import importlib.metadata as metadata, json, sys
