@@ -7,6 +7,7 @@ The fields of the messages: docs/sources/messages.md and docs/sources/outputs.md
 from __future__ import annotations
 
 import json
+import struct
 from collections import Counter
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -44,6 +45,8 @@ _MESSAGE_BYTES = 400
 TF_STATIC = "/tf_static"
 TF_TYPE = "tf2_msgs/TFMessage"
 
+# A header begins with the time, after four bytes: its kind in CDR, its number in ROS 1.
+_STAMP_AT = 4
 # sensor_msgs/Imu: -1 in the covariance means no orientation; a covariance of zeros is unknown.
 _NO_ORIENTATION = (0.0, 0.0, 0.0, 1.0, -1.0, *[0.0] * 8)
 _UNKNOWN_COVARIANCE = (0.0,) * 9
@@ -153,6 +156,7 @@ class MessageWriter:
         if options.split:
             for number, sensor in enumerate(info.sensors):
                 self._topics[number] = f"/{sensor.name}/points"
+        self._imu = [ImuMessages(imu_frame(sensor.name), wire) for sensor in info.sensors]
         imu = (f"/{sensor.name}/imu" for sensor in info.sensors)
         self._own = frozenset({TF_STATIC, *self._topics.values(), *imu})
         with export_errors(self._output.partial):
@@ -262,10 +266,10 @@ class MessageWriter:
         if isinstance(item, Message):
             self._file.forward(item)
             return
-        name = self._info.sensors[item.sensor].name
-        messages = imu_messages(item, imu_frame(name), self._wire)
+        messages = self._imu[item.sensor].of(item)
+        topic = f"/{self._info.sensors[item.sensor].name}/imu"
         for stamp_ns, message in zip(item.stamp_ns.tolist(), messages, strict=True):
-            self._file.send(f"/{name}/imu", "sensor_msgs/Imu", stamp_ns, message)
+            self._file.send(topic, "sensor_msgs/Imu", stamp_ns, message)
 
     def _grid(self, t_init_ns: int | None) -> dict[str, str]:
         info = self._info
@@ -347,6 +351,7 @@ class CloudMessage:
         self._frame_id = frame_id
         self._wire = wire
         self._records = ScanRecords(layout)
+        self._describe()
 
     def message(self, scan: Scan, stamp_ns: int, dense: bool) -> memoryview:
         """Return the message of a scan, in the buffer of its records: valid as long as that is."""
@@ -366,43 +371,60 @@ class CloudMessage:
         """Return the message up to its points; shape: (width,) or (height, width)."""
         step = self._layout.step
         height, width = shape if len(shape) == 2 else (1, shape[0])
+        struct.pack_into("<iI", self._template, _STAMP_AT, *divmod(stamp_ns, NS_PER_S))
+        struct.pack_into("<II", self._template, self._size_at, height, width)
+        # The row and the data, at the end.
+        size = len(self._template)
+        struct.pack_into("<II", self._template, size - 8, step * width, step * width * height)
+        return self._template
+
+    def _describe(self) -> None:
+        """Begin the template of `_head`; all heads have its length."""
         message = self._wire()
-        message.header(stamp_ns, self._frame_id)
-        message.put("I", height, width, len(self._layout.fields))
+        message.header(0, self._frame_id)
+        message.put("I", 0)
+        self._size_at = len(message.data) - 4
+        message.put("I", 0, len(self._layout.fields))
         for field in self._layout.fields:
             message.text(field.name)
             message.put("I", field.offset)
             message.put("B", FIELD_CODES[field.dtype])
             message.put("I", 1)
         message.put("B", 0)
-        message.put("I", step, step * width, step * width * height)
-        return message.data
+        message.put("I", self._layout.step, 0, 0)
+        self._template = message.data
 
 
-def imu_messages(samples: ImuSamples, frame_id: str, wire: NewWire) -> list[bytes]:
-    """Return the sensor_msgs/Imu of all samples, whose bytes differ in times and values alone."""
-    message = wire()
-    message.header(0, frame_id)
-    message.put("d", *_NO_ORIENTATION)
-    # Angular velocity and acceleration, each with its covariance: the end of the message.
-    message.put("d", 0, 0, 0, *_UNKNOWN_COVARIANCE, 0, 0, 0, *_UNKNOWN_COVARIANCE)
-    size = len(message.data)
-    acceleration_at = size - 8 * (3 + len(_UNKNOWN_COVARIANCE))
-    layout = np.dtype(
-        {
-            "names": ["time", "angular_velocity", "acceleration"],
-            "formats": [("<u4", 2), ("<f8", 3), ("<f8", 3)],
-            # A header begins with the time, after four bytes: its kind in CDR, its number in ROS 1.
-            "offsets": [4, 2 * acceleration_at - size, acceleration_at],
-            "itemsize": size,
-        }
-    )
-    data = message.data * len(samples.stamp_ns)
-    rows = np.frombuffer(data, layout)
-    rows["time"][:, 0], rows["time"][:, 1] = np.divmod(samples.stamp_ns, NS_PER_S)
-    rows["angular_velocity"] = samples.angular_velocity
-    rows["acceleration"] = samples.acceleration
-    return [bytes(data[begin : begin + size]) for begin in range(0, len(data), size)]
+class ImuMessages:
+    """Makes sensor_msgs/Imu of a sensor, which differ in times and values alone."""
+
+    def __init__(self, frame_id: str, wire: NewWire) -> None:
+        message = wire()
+        message.header(0, frame_id)
+        message.put("d", *_NO_ORIENTATION)
+        # Angular velocity and acceleration, each with its covariance: the end of the message.
+        message.put("d", 0, 0, 0, *_UNKNOWN_COVARIANCE, 0, 0, 0, *_UNKNOWN_COVARIANCE)
+        size = len(message.data)
+        acceleration_at = size - 8 * (3 + len(_UNKNOWN_COVARIANCE))
+        self._template = message.data
+        self._layout = np.dtype(
+            {
+                "names": ["time", "angular_velocity", "acceleration"],
+                "formats": [("<u4", 2), ("<f8", 3), ("<f8", 3)],
+                "offsets": [_STAMP_AT, 2 * acceleration_at - size, acceleration_at],
+                "itemsize": size,
+            }
+        )
+
+    def of(self, samples: ImuSamples) -> list[bytes]:
+        """Return the messages of all samples."""
+        data = self._template * len(samples.stamp_ns)
+        rows = np.frombuffer(data, self._layout)
+        rows["time"][:, 0], rows["time"][:, 1] = np.divmod(samples.stamp_ns, NS_PER_S)
+        rows["angular_velocity"] = samples.angular_velocity
+        rows["acceleration"] = samples.acceleration
+        size = self._layout.itemsize
+        return [bytes(data[begin : begin + size]) for begin in range(0, len(data), size)]
 
 
 def static_transforms(info: RunInfo, stamp_ns: int, wire: NewWire) -> bytes:
