@@ -424,6 +424,7 @@ class _Pass:
         self._source = source
         self._reader = _HeaderReader()
         self._decompressor = Decompressor()
+        self._gathered: U8Array = np.zeros(BUFFER_BYTES, np.uint8)
         # Topic of each connection, -1 where its topic is not selected.
         self._topics: dict[int, int] = {}
         self._cut = False
@@ -454,30 +455,42 @@ class _Pass:
 
     def _records(self, data: U8Array, walked: _Records) -> Generator[Portion, None, None]:
         """Records outside chunks: chunks, and messages of a bag that was never closed."""
-        plain: list[_Records] = []
+        # Messages of many chunks are read together, if they are in one buffer.
+        source = data
+        parts: list[_Records] = []
+        gathered_bytes = 0
         bare: list[int] = []
         for index, (head, head_size, body, size) in enumerate(_rows(walked)):
             raw = _bytes(data, head, head_size)
             op = _op_of(raw)
             if op in (_Op.MESSAGE, _Op.CONNECTION):
                 bare.append(index)
-            elif op == _Op.CHUNK:
-                fields = _head_fields(raw)
-                if _compression(fields) == _PLAIN:
-                    # Messages of all chunks in one buffer are read together.
-                    for part in self._inside(data, body, body + size):
-                        plain.append(part)
-                        if len(part.head) == _MOST_RECORDS:
-                            yield from self._messages(data, plain)
-                            plain = []
-                    continue
-                yield from self._messages(data, plain)
-                plain = []
-                unpacked = self._unpack(fields, data.data[body : body + size])
-                for part in self._inside(unpacked, 0, len(unpacked)):
-                    yield from self._messages(unpacked, [part])
-        plain.append(walked.take(np.array(bare, np.int64)))
-        yield from self._messages(data, plain)
+            if op != _Op.CHUNK:
+                continue
+            fields = _head_fields(raw)
+            chunk, begin, end = data, body, body + size
+            if _compression(fields) != _PLAIN:
+                chunk = self._unpack(fields, data.data[body : body + size])
+                begin, end = 0, len(chunk)
+                if len(chunk) <= len(self._gathered):
+                    if gathered_bytes + len(chunk) > len(self._gathered):
+                        yield from self._messages(source, parts)
+                        parts = []
+                        gathered_bytes = 0
+                    begin, end = gathered_bytes, gathered_bytes + len(chunk)
+                    self._gathered[begin:end] = chunk
+                    chunk = self._gathered
+                    gathered_bytes = end
+            if chunk is not source:
+                yield from self._messages(source, parts)
+                source, parts = chunk, []
+            for part in self._inside(chunk, begin, end):
+                parts.append(part)
+                if len(part.head) == _MOST_RECORDS:
+                    yield from self._messages(source, parts)
+                    parts = []
+        yield from self._messages(source, parts)
+        yield from self._messages(data, [walked.take(np.array(bare, np.int64))])
 
     def _inside(self, data: U8Array, begin: int, end: int) -> Iterator[_Records]:
         """The records of a chunk, in parts."""
