@@ -91,7 +91,7 @@ def test_messages_in_a_file_come_as_those_in_memory(
     with (
         patch.object(passthrough, "_MEMORY_BYTES", memory_bytes),
         patch.object(passthrough, "_FAR_NS", far_ns),
-        patch.object(message_spill, "_PIECE_BYTES", 70),
+        patch.object(message_spill, "_READ_BYTES", 70),
     ):
         in_file = MessageQueue([], frozenset({"cdr"}))
         left = messages
@@ -131,14 +131,19 @@ def test_memory_does_not_depend_on_the_messages_that_wait() -> None:
 
 
 def test_a_full_disk_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
-    def full(*_: object) -> int:
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr("os.pwrite", full)
+    small = f"PRAGMA max_page_count = 200; {message_spill._BEGIN}"
+    monkeypatch.setattr(message_spill, "_BEGIN", small)
     queue = MessageQueue([], frozenset({"cdr"}))
-    with pytest.raises(ExportError, match=r"No space left on device.*set TMPDIR") as error:
+    with pytest.raises(ExportError, match=r"disk is full.*set TMPDIR") as error:
         queue.add(Message(TOPICS[0], at, bytes(300_000)) for at in range(20))
     assert "\n" not in str(error.value)
+
+
+def test_a_folder_that_is_not_there_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("tempfile.tempdir", "/no/folder")
+    queue = MessageQueue([], frozenset({"cdr"}))
+    with pytest.raises(ExportError, match=r"^/no/folder: .*No such file.*set TMPDIR"):
+        queue.add(Message(TOPICS[0], at, bytes(300_000)) for at in range(20))
 
 
 def test_imu_samples_without_a_scan_are_joined() -> None:
