@@ -433,8 +433,11 @@ def _with_number(path: Path | None, number: int, *suffixes: str) -> Path | None:
 def _is_complete(job: Job, output: Path, target: Target, name: str, options: WriterOptions) -> bool:
     """True if an earlier run of this job completed the output: there is nothing to resume.
 
-    UsageError if another job made the output; name: of the format.
+    UsageError if another job made the output, ExportError if files of it are missing; name: of the
+    format.
     """
+    from mlbatch.pipeline.files import missing
+
     if target.overwrite or not output.exists() or partial_path(output).exists():
         return False
     changed = _difference_of_output(job, output, target, name, options)
@@ -442,6 +445,12 @@ def _is_complete(job: Job, output: Path, target: Target, name: str, options: Wri
         raise UsageError(
             f"{output}: expected the complete output of this job for --resume, found {changed}; "
             "choose another output, or replace this one with --overwrite"
+        )
+    lost = missing(output, job, name, options)
+    if lost:
+        raise ExportError(
+            f"{output}: expected all files of the complete output for --resume, found {len(lost)} "
+            f"missing, first {lost[0]}; restore it, or make all again with --overwrite"
         )
     tidy(output)
     say(f"{output}: is complete; there is nothing to resume")

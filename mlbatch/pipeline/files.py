@@ -24,8 +24,9 @@ from typing import TYPE_CHECKING, NamedTuple, TypeAlias, TypeVar
 import numpy as np
 from isal.isal_zlib import crc32
 
-from mlbatch.bounded import parse_json
+from mlbatch.bounded import MOST_TABLE_BYTES, parse_json, read_text
 from mlbatch.errors import ExportError, UsageError
+from mlbatch.outputs.table import read_table
 from mlbatch.pipeline.job import Job
 from mlbatch.pipeline.job_identity import difference, input_identity, job_identity
 from mlbatch.report.json_records import from_json, to_json
@@ -39,9 +40,14 @@ from mlbatch.writers import (
     has_several_files,
     locked,
     partial_path,
+    plugin,
 )
+from mlbatch.writers.atomic import SCANS_CSV
+from mlbatch.writers.bag_metadata import METADATA
 from mlbatch.writers.base import windows_per_file
+from mlbatch.writers.formats import file_suffixes
 from mlbatch.writers.output_file import file_crc, write_all
+from mlbatch.writers.scan_folder import scan_name
 
 if TYPE_CHECKING:
     from mlbatch.pipeline.conversion import Conversion
@@ -199,6 +205,47 @@ def find(target: Path) -> EarlierRun | None:
         head = _parsed(Head, file.readline(_MOST_HEAD_BYTES))
         earlier = None if head is None or head.schema != SCHEMA else EarlierRun(folder, head)
     return earlier if earlier is not None and earlier.names else None
+
+
+def missing(target: Path, job: Job, name: str, options: WriterOptions) -> list[str]:
+    """Files that a complete output should have and has not, sorted; name: of the format.
+
+    Those of a shard are in its `files.jsonl`, those of a bag in its metadata.yaml; scans.csv has a
+    row for each scan. Raises RecordingError for a damaged table or list.
+    """
+    if plugin(name).SUFFIX is not None:
+        return []
+    present = {path.relative_to(target).as_posix() for path in target.rglob("*")}
+    if job.shard is not None:
+        expected = {SCANS_CSV, FILES_JSONL}
+        if FILES_JSONL in present:
+            expected |= {one for _, found in records(target / FILES_JSONL) for one in found.crcs}
+    elif has_several_files(name, options) and not job.max_bag_s:
+        expected = {SCANS_CSV, *_files_of_scans(target, job, name)}
+    else:
+        expected = {SCANS_CSV, METADATA}
+        if METADATA in present:
+            from mlbatch.verify.rosbag2 import listed_files
+
+            expected |= set(listed_files(target))
+    return sorted(expected - present)
+
+
+def _files_of_scans(folder: Path, job: Job, name: str) -> Iterator[str]:
+    """The files of the scans in scans.csv, none without one."""
+    path = folder / SCANS_CSV
+    if not path.is_file():
+        return
+    with export_errors(path):
+        rows = read_table(read_text(path, MOST_TABLE_BYTES), str(path))
+    prefix = "columns_"
+    sensors = [one.removeprefix(prefix) for one in rows.dtype.names or () if one.startswith(prefix)]
+    for row in rows:
+        stem = scan_name(int(row["index"]), int(row["slice"]), job.slices)
+        # A sensor without a column in a window has no file of it.
+        folders = [f"{one}/" for one in sensors if row[prefix + one]] if job.split else [""]
+        for suffix in file_suffixes(name) or (name,):
+            yield from (f"{one}{stem}.{suffix}" for one in folders)
 
 
 # -- the run ----------------------------------------------------------------------------------

@@ -39,15 +39,26 @@ class BagFile(NamedTuple):
     span_ns: tuple[int, int]
 
 
-def open_bag(log: CheckLog, folder: Path) -> tuple[list[Path], Yaml]:
-    """The MCAP files of a bag by their numbers, one at least, and the content of metadata.yaml."""
+def read_metadata(folder: Path) -> Yaml:
+    """The content of metadata.yaml."""
     path = folder / METADATA
     try:
         root: Yaml = yaml.load(read_text(path, _LARGEST_BYTES), PlainLoader)
     except (OSError, ValueError, RecursionError, yaml.YAMLError) as err:
         text = " ".join(str(err).split())
         raise VerifyError(f"{path}: expected YAML, found {text}; restore it") from err
-    about = _value_at(root, "rosbag2_bagfile_information")
+    return _value_at(root, "rosbag2_bagfile_information")
+
+
+def listed_files(folder: Path) -> list[str]:
+    """The names of the files of a bag in its metadata.yaml."""
+    names = _value_at(read_metadata(folder), "relative_file_paths")
+    return [str(name) for name in names] if isinstance(names, list) else []
+
+
+def open_bag(log: CheckLog, folder: Path) -> tuple[list[Path], Yaml]:
+    """The MCAP files of a bag by their numbers, one at least, and the content of metadata.yaml."""
+    about = read_metadata(folder)
     files = sorted(
         (found for found in folder.iterdir() if found.suffix == ".mcap"),
         # Numbers have no leading zeros.

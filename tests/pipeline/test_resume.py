@@ -244,6 +244,48 @@ def test_a_complete_output_is_left_alone(shell: Shell) -> None:
     assert Path("out/report.json").read_bytes() != before
 
 
+@pytest.mark.parametrize(
+    ("words", "name", "fault"),
+    [
+        ("", "000003.npz", "table"),
+        ("--format ply --split", "right/000003.ply", "table"),
+        ("--slices 2", "000003-1.npz", "table"),
+        ("--keep-partial", "head.npz", "table"),
+        ("--format nuscenes", "000003.time.bin", "container"),
+        ("--format rosbag2", "out_0.mcap", ""),
+        ("--format rosbag2 --max-bag-duration 0.2", "out_1.mcap", "names"),
+        ("", "scans.csv", "table"),
+    ],
+)
+def test_a_file_missing_in_a_complete_output_is_named(
+    shell: Shell, words: str, name: str, fault: str
+) -> None:
+    shell(f"convert {CAPTURE} {words} -o out")
+    assert "is complete" in shell(f"convert {CAPTURE} {words} -o out --resume").err
+    Path("out", name).unlink()
+    refused = shell(f"convert {CAPTURE} {words} -o out --resume")
+    assert (refused.code, refused.err) == (
+        1,
+        "mlbatch: error: out: expected all files of the complete output for --resume, found 1 "
+        f"missing, first {name}; restore it, or make all again with --overwrite\n",
+    )
+    judged = shell("verify out --json")
+    assert judged.code != 0
+    if fault:
+        assert fault in {one["check"] for one in json.loads(judged.out)["violations"]}
+    assert shell(f"convert {CAPTURE} {words} -o out --resume --overwrite").code == 0
+    assert Path("out", name).is_file()
+
+
+def test_a_file_missing_in_a_shard_is_named(shell: Shell) -> None:
+    words = f"convert {CAPTURE} --format npz --shard 1/2 -o out"
+    shell(words)
+    lost = min(Path("out").glob("0*.npz"))
+    lost.unlink()
+    refused = shell(f"{words} --resume")
+    assert (refused.code, f"found 1 missing, first {lost.name};" in refused.err) == (1, True)
+
+
 def test_without_it_a_partial_is_replaced_and_the_option_named(shell: Shell) -> None:
     _interrupt(shell)
     outcome = shell(f"convert {CAPTURE} -o out")

@@ -51,10 +51,11 @@ def format_of_files(suffix: str) -> str | None:
     """
     if is_format(suffix):
         return suffix if format_module(suffix).SUFFIX is None else None
-    return next((name for name in built_in_names() if suffix in _file_suffixes(name)), None)
+    return next((name for name in built_in_names() if suffix in file_suffixes(name)), None)
 
 
-def _file_suffixes(name: str) -> tuple[str, ...]:
+def file_suffixes(name: str) -> tuple[str, ...]:
+    """Return the suffixes of the files of a scan, without a dot, unless it is the format's name."""
     found: tuple[str, ...] = getattr(format_module(name), "FILE_SUFFIXES", ())
     return found
 
