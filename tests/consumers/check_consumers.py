@@ -1,6 +1,6 @@
 """What unmodified programs of others read from our outputs is what the npz has, number by number.
 
-Run by `make test-consumers`; the table of results is docs/consumers.md. Not part of `make test`: it
+Run by `make test-consumers`; the table of results is docs/formats.md. Not part of `make test`: it
 installs a gigabyte of packages.
 """
 

@@ -25,7 +25,7 @@ _RUN_S = 600
 
 @dataclass(frozen=True, slots=True)
 class Environment:
-    """Packages of PyPI or npm; versions: those that docs/consumers.md names."""
+    """Packages of PyPI or npm; versions: those that docs/formats.md names."""
 
     name: str
     packages: tuple[str, ...]
@@ -130,13 +130,13 @@ def need_library(name: str) -> None:
     try:
         ctypes.CDLL(name)
     except OSError:
-        pytest.skip(f"{name} is not installed (docs/consumers.md says which package has it)")
+        pytest.skip(f"{name} is not installed (docs/formats.md says which package has it)")
 
 
 def _program(name: str) -> str:
     found = shutil.which(name)
     if found is None:
-        pytest.skip(f"{name} is not installed (docs/consumers.md says which package has it)")
+        pytest.skip(f"{name} is not installed (docs/formats.md says which package has it)")
     return found
 
 
