@@ -57,6 +57,9 @@ def main() -> None:
     except MemoryError:
         _fail("out of memory; use a smaller --max-wait, or convert a part with --end", EXIT_ERROR)
     except Exception as err:
+        if isinstance(err.__cause__, KeyboardInterrupt):
+            # While a class was made: Python 3.11 and older raise it as a RuntimeError.
+            _fail("interrupted", EXIT_INTERRUPTED)
         usage = _usage(err)
         if usage:
             _fail(f"{usage}; see `mlbatch --help`", EXIT_USAGE)

@@ -23,7 +23,7 @@ from mlbatch.errors import RigError
 from mlbatch.frames.naming import Candidate, candidates, named_frame
 from mlbatch.frames.transforms import compose, inverse
 from mlbatch.frames.tree import Chain, Edge, FrameTree, clean, difference, edge_of, some
-from mlbatch.lidar.limits import MAX_TRANSLATION_M
+from mlbatch.lidar.limits import FAR_POSE_M, MAX_TRANSLATION_M
 from mlbatch.rig.rig import DEFAULT_BODY_FRAME, Rig, UnknownExtrinsics
 from mlbatch.types import Stream, StreamTable
 from mlbatch.units import MM_PER_M, RAD_PER_DEG
@@ -37,8 +37,6 @@ TREE_SOURCES = ("tf_static", "tf", "urdf")
 # Poses farther apart contradict each other.
 MAX_APART_M = 1e-3
 MAX_APART_RAD = 0.1 * RAD_PER_DEG
-# No vehicle has a sensor farther from its body origin; millimetres given for metres are.
-FAR_M = 20.0
 # Angles of mounts are multiples of this, where they are round.
 _EIGHTH_RAD = math.pi / 4
 # Sources print their numbers with different digits; a difference at the bound is accepted.
@@ -471,9 +469,9 @@ def _far_poses(poses: Mapping[str, Pose]) -> Iterator[Note]:
     """Warnings about sensors that are too far from the body origin for a vehicle."""
     for name, pose in poses.items():
         away_m = float(np.linalg.norm(pose.body_from_sensor[:3, 3]))
-        if away_m > FAR_M:
+        if away_m > FAR_POSE_M:
             text = (
-                f"expected at most {FAR_M:g} m from the body origin, found {away_m:.6g} m "
+                f"expected at most {FAR_POSE_M:g} m from the body origin, found {away_m:.6g} m "
                 f"({pose.describe()}): as millimetres this would be {away_m / MM_PER_M:.4g} m; "
                 "give metres, from an origin on the vehicle"
             )

@@ -207,6 +207,17 @@ def test_an_interrupt_of_what_writes_nothing_speaks_of_no_output(
     assert outcome.err == "mlbatch: error: interrupted\n"
 
 
+def test_an_interrupt_while_a_class_is_made(shell: Shell, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Python up to 3.11 wraps what a `__set_name__` raises in a RuntimeError."""
+
+    def interrupt(*_: object) -> None:
+        raise RuntimeError("Error calling __set_name__") from KeyboardInterrupt()
+
+    monkeypatch.setattr("mlbatch.pipeline.conversion.Batcher.push", interrupt)
+    outcome = shell("convert", "--dry-run", CAPTURE, "--rig", RIG)
+    assert (outcome.code, outcome.err) == (130, "mlbatch: error: interrupted\n")
+
+
 def test_a_reader_that_goes_away_is_no_error_worth_a_traceback() -> None:
     with subprocess.Popen(
         [sys.executable, "-m", "mlbatch", "sensors"],
