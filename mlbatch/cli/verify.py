@@ -54,7 +54,7 @@ def verify(
 def _values(verdict: Verdict) -> dict[str, object]:
     """The verdict as JSON; the names of its fields are fixed."""
     return {
-        "schema": "mlbatch.verdict/1",
+        "schema": "mlbatch.verdict/2",
         "output": verdict.path,
         "format": verdict.format,
         "ok": verdict.ok,
@@ -65,14 +65,14 @@ def _values(verdict: Verdict) -> dict[str, object]:
             {
                 "name": check.name,
                 "outcome": check.outcome,
-                "judged": check.checked,
+                "checked": check.checked,
                 "violations": check.violations,
                 "limit": check.limit,
             }
             for check in verdict.checks
         ],
         "violations": [
-            {"check": one.check, "where": one.where, "wanted": one.expected, "got": one.found}
+            {"check": one.check, "where": one.where, "expected": one.expected, "found": one.found}
             for one in verdict.violations
         ],
     }

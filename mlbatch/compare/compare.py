@@ -35,7 +35,7 @@ from mlbatch.pipeline.job import Job
 from mlbatch.pipeline.sensor import Sensor
 from mlbatch.units import NS_PER_MS, NS_PER_S, rate_text
 
-SCHEMA = "mlbatch.compare/1"
+SCHEMA = "mlbatch.compare/2"
 WINDOWS = "windows (mlbatch)"
 Value: TypeAlias = str | int | float | Sequence["Value"] | Mapping[str, "Value"] | None
 
@@ -54,8 +54,8 @@ class SensorSweeps:
         return {
             "name": self.name,
             "model": self.model,
-            "turns": self.sweeps,
-            "turn_ms": self.sweep_ms,
+            "revolutions": self.sweeps,
+            "revolution_ms": self.sweep_ms,
         }
 
 
@@ -127,7 +127,7 @@ class Comparison:
             "timeout_ms": self.timeout_ms,
             "compared_s": self.compared_s,
             "sensors": [sensor.as_json() for sensor in self.sensors],
-            "ways": [report.as_json() for report in self.reports],
+            "policies": [report.as_json() for report in self.reports],
         }
 
 

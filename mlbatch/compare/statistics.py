@@ -106,7 +106,7 @@ class SetReport:
     def as_json(self) -> dict[str, str | int | dict[str, float | None]]:
         """The policy in the JSON document."""
         return {
-            "way": self.policy,
+            "policy": self.policy,
             "sets": self.sets,
             "without_a_sensor": self.without_a_sensor,
             "stale": self.stale,

@@ -109,7 +109,7 @@ def _compare_field(result: Comparison, where: str, name: str, old: Json, new: Js
         return
     found = [
         difference
-        for key in ("mean", "min", "max", "four")
+        for key in ("mean", "min", "max", "samples")
         for difference in walk(f"{where} {name} {key}", old.get(key), new.get(key))
     ]
     # Other points may differ than those of the figures.

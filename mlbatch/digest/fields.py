@@ -38,11 +38,11 @@ def describe(array: Values, valid: npt.NDArray[np.bool_] | None) -> dict[str, Js
     kept = array if valid is None else array[valid]
     if len(kept):
         last = len(kept) - 1
-        four = [last * part // _PARTS for part in range(_PARTS + 1)]
+        samples = [last * part // _PARTS for part in range(_PARTS + 1)]
         found["mean"] = mean(kept)
         found["min"] = values(kept.min(axis=0))
         found["max"] = values(kept.max(axis=0))
-        found["four"] = values(kept[four])
+        found["samples"] = values(kept[samples])
     return found
 
 

@@ -17,9 +17,9 @@ from mlbatch.outputs.run_files import RunFiles
 from mlbatch.outputs.scan import Scan
 from mlbatch.outputs.table import read_table
 
-SCHEMA = "mlbatch.digest/2"
-# Schema 1 has no version; the rest is the same.
-_READ = (SCHEMA, "mlbatch.digest/1")
+SCHEMA = "mlbatch.digest/3"
+# Schema 1 has no version; 1 and 2 have `four` for `samples`; the rest is the same.
+_EARLIER = ("mlbatch.digest/1", "mlbatch.digest/2")
 _STAMPS = ("first_stamp_ns", "last_stamp_ns")
 
 
@@ -102,10 +102,21 @@ def read_golden(path: Path) -> dict[str, Json]:
             "`mlbatch digest OUTPUT -o FILE`"
         ) from err
     schema = golden.get("schema") if isinstance(golden, dict) else None
-    if schema not in _READ or not isinstance(golden.get("scans"), list):
+    if schema not in (SCHEMA, *_EARLIER) or not isinstance(golden.get("scans"), list):
         raise RecordingError(
             f"{path}: expected a golden file of the schema {SCHEMA}, found {schema!r}; write one "
             "with `mlbatch digest OUTPUT -o FILE`"
         )
     found_golden: dict[str, Json] = golden
+    if schema in _EARLIER:
+        _rename_samples(found_golden)
     return found_golden
+
+
+def _rename_samples(golden: dict[str, Json]) -> None:
+    scans = golden["scans"]
+    for scan in scans if isinstance(scans, list) else ():
+        fields = scan.get("fields") if isinstance(scan, dict) else None
+        for field in fields.values() if isinstance(fields, dict) else ():
+            if isinstance(field, dict) and "four" in field:
+                field["samples"] = field.pop("four")

@@ -37,15 +37,15 @@ def test_json_and_all_vendors(shell: Shell) -> None:
     outcome = shell(f"{words} --rate 10 --tolerance 0.08 --timeout 0.2")
     assert (outcome.code, outcome.err) == (0, "")
     found = json.loads(outcome.out)
-    assert found["schema"] == "mlbatch.compare/1"
+    assert found["schema"] == "mlbatch.compare/2"
     assert (found["rate_hz"], found["period_ms"]) == ("10", 100)
     assert (found["tolerance_ms"], found["timeout_ms"]) == (80, 200)
-    sweeps_hz = {one["name"]: 1000 / one["turn_ms"] for one in found["sensors"]}
+    sweeps_hz = {one["name"]: 1000 / one["revolution_ms"] for one in found["sensors"]}
     expected_hz = {"left": 9.999, "roof": 10, "right": 12.5, "rear": 9.95}
     # Sweeps are cut at columns: one column more or less is 0.01 Hz.
     assert sweeps_hz == pytest.approx(expected_hz, abs=0.015)
-    assert [way["way"] for way in found["ways"]][-1] == "windows (mlbatch)"
-    assert found["ways"][-1]["span_ms"]["max"] < 100
+    assert [one["policy"] for one in found["policies"]][-1] == "windows (mlbatch)"
+    assert found["policies"][-1]["span_ms"]["max"] < 100
 
 
 def test_host_clock(shell: Shell, tmp_path: Path) -> None:
@@ -61,7 +61,7 @@ def test_host_clock(shell: Shell, tmp_path: Path) -> None:
     assert "expected at most 1 s between them, found 3600.000 s " in refused.err
     outcome = shell(f"compare {capture} --clock host --json")
     assert outcome.code == 0
-    assert json.loads(outcome.out)["ways"][0]["span_ms"]["max"] < 100
+    assert json.loads(outcome.out)["policies"][0]["span_ms"]["max"] < 100
 
 
 def test_one_lidar_is_refused(shell: Shell, tmp_path: Path) -> None:
@@ -111,14 +111,14 @@ def test_latencies_of_the_fixture(shell: Shell) -> None:
     Windows end 10 ms after their period, which waits for late packets.
     """
     outcome = shell(f"compare {CAPTURE} --rig {FIXTURE / 'rig.yaml'} --json")
-    ways = {one["way"]: one["latency_ms"] for one in json.loads(outcome.out)["ways"]}
+    policies = {one["policy"]: one["latency_ms"] for one in json.loads(outcome.out)["policies"]}
     expected = {
         "latest sweeps": 163,
         "approximate time": 137,
         "timeout collate": 163,
         "windows (mlbatch)": 110,
     }
-    found = {name: latency["p50"] for name, latency in ways.items()}
+    found = {name: latency["p50"] for name, latency in policies.items()}
     assert found == pytest.approx(expected, abs=0.6)
 
 
@@ -159,7 +159,7 @@ def test_a_page_may_be_printed(shell: Shell, tmp_path: Path) -> None:
 
 def test_json_stays_json(shell: Shell) -> None:
     words = f"compare {CAPTURE} --rig {FIXTURE / 'rig.yaml'} --json --html run.html"
-    assert json.loads(shell(words).out)["schema"] == "mlbatch.compare/1"
+    assert json.loads(shell(words).out)["schema"] == "mlbatch.compare/2"
     assert Path("run.html").is_file()
 
 

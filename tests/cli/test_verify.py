@@ -60,7 +60,7 @@ def test_json(tmp_path: Path) -> None:
     result = command("verify", made("scans.mcap"), "--json")
     found = json.loads(result.out)
     assert result.code == 0
-    assert found["schema"] == "mlbatch.verdict/1"
+    assert found["schema"] == "mlbatch.verdict/2"
     assert (found["ok"], found["format"], found["scans"]) == (True, "mcap, standard", 4)
     assert found["columns"] is None
     assert [check["name"] for check in found["checks"]] == list(CHECKS)

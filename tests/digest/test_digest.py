@@ -79,7 +79,7 @@ def test_a_field_is_described_by_checksum_statistics_and_four_points() -> None:
         "mean": pytest.approx(13.875 / 7, abs=1e-9),
         "min": -2.0,
         "max": 9.0,
-        "four": [1.5, 9.0, 0.125, 1.0],
+        "samples": [1.5, 9.0, 0.125, 1.0],
     }
 
 
@@ -87,7 +87,7 @@ def test_empty_slots_have_no_part_in_statistics() -> None:
     array = np.array([[np.nan, 3.0], [5.0, np.nan]], np.float32)
     found = describe(array, np.isfinite(array))
     assert (found["mean"], found["min"], found["max"]) == (4.0, 3.0, 5.0)
-    assert found["four"] == [3.0, 3.0, 3.0, 5.0]
+    assert found["samples"] == [3.0, 3.0, 3.0, 5.0]
 
 
 def test_an_array_without_values_has_only_a_checksum() -> None:
@@ -199,7 +199,7 @@ def test_a_microsecond_of_clock_is_found(kind: str, tmp_path: Path) -> None:
 # Changes of a document: path, and what is added.
 CHANGES: dict[str, tuple[tuple[Any, ...], float]] = {
     "real": (("fields", "xyz", "mean", 1), 0.00004),
-    "one of four points": (("fields", "range_m", "four", 2), -0.001),
+    "one of the samples": (("fields", "range_m", "samples", 2), -0.001),
     "integer": (("fields", "ring", "max"), 1),
     "fill": (("fill", 0), -0.0001),
     "points": (("points",), -1),
@@ -270,12 +270,19 @@ def test_other_bytes_with_the_same_figures_are_found(npz: Path) -> None:
     assert places == ["scan 000000 intensity sha256"]
 
 
-def test_files_of_schema_1_are_read(npz: Path, tmp_path: Path) -> None:
-    """They differ by having no version."""
-    golden = mlbatch.digest(npz)
+@pytest.mark.parametrize("schema", ["mlbatch.digest/1", "mlbatch.digest/2"])
+def test_files_of_earlier_schemas_are_read(schema: str, npz: Path, tmp_path: Path) -> None:
+    """They have other keys: `four` for `samples`, and those of schema 1 no version."""
+    golden: Golden = mlbatch.digest(npz)
     path = tmp_path / "golden.json"
-    path.write_text(json.dumps(golden | {"schema": "mlbatch.digest/1"}), encoding="utf-8")
+    text = json.dumps(golden | {"schema": schema}).replace('"samples":', '"four":')
+    path.write_text(text, encoding="utf-8")
     assert command("digest", npz, "--against", path).code == 0
+    other = copy.deepcopy(golden)
+    fields(other)["xyz"]["sha256"] = "0" * 16
+    fields(other)["xyz"]["samples"][1][2] += 0.5
+    places = [one.where for one in compare(read_golden(path), other).differences]
+    assert places == ["scan 000000 xyz samples[1][2]"]
 
 
 def test_missing_and_added_scans_fields_and_warnings_are_found(tmp_path: Path) -> None:

@@ -269,10 +269,10 @@ def test_a_file_missing_in_a_complete_output_is_named(
         "mlbatch: error: out: expected all files of the complete output for --resume, found 1 "
         f"missing, first {name}; restore it, or make all again with --overwrite\n",
     )
-    judged = shell("verify out --json")
-    assert judged.code != 0
+    verdict = shell("verify out --json")
+    assert verdict.code != 0
     if fault:
-        assert fault in {one["check"] for one in json.loads(judged.out)["violations"]}
+        assert fault in {one["check"] for one in json.loads(verdict.out)["violations"]}
     assert shell(f"convert {CAPTURE} {words} -o out --resume --overwrite").code == 0
     assert Path("out", name).is_file()
 
