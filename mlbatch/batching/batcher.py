@@ -27,7 +27,7 @@ from mlbatch.arrays import BoolArray, I64Array
 from mlbatch.batching.fill import UNKNOWN_PACE, FillMeter, Pace
 from mlbatch.batching.gaps import EdgeGaps
 from mlbatch.batching.grid import Grid
-from mlbatch.batching.intake import FOREVER, NEVER, STEP_NS, Accepted, Arrival, Intake, JumpGuard
+from mlbatch.batching.intake import FOREVER, NEVER, STEP_NS, Accepted, Intake
 from mlbatch.batching.merge import ColumnMerge
 from mlbatch.batching.windows import Policy, Schedule, Window
 from mlbatch.clocks.compare import refuse_incomparable
@@ -78,15 +78,13 @@ class Batcher:
         grid: Grid,
         intakes: Sequence[Intake],
         policy: Policy,
-        guards: Sequence[JumpGuard] = (),
         paces: Sequence[Pace] = (),
         merge: ColumnMerge | None = None,
     ) -> None:
         """Arguments of a run.
 
-        intakes: one a sensor; guards: one a sensor, or none where clocks are not checked; paces:
-        one a sensor, or none where the rates are unknown; merge: shared with
-        the fusion of sweeps, or None.
+        intakes: one a sensor; paces: one a sensor, or none where the rates are unknown; merge:
+        shared with the fusion of sweeps, or None.
         """
         self._grid = grid
         self._policy = policy
@@ -95,7 +93,6 @@ class Batcher:
         self._watermark = NEVER
         # All columns before this stamp are published.
         self._until = NEVER
-        self._guards = tuple(guards)
         self._gaps = EdgeGaps(len(self._tracks))
         paces = paces or [UNKNOWN_PACE] * len(self._tracks)
         self._fill = FillMeter(paces)
@@ -103,12 +100,12 @@ class Batcher:
 
     # -- main loop ----------------------------------------------------------------------------
 
-    def push(self, arrivals: Sequence[Arrival | None], host_ns: I64Array) -> Iterator[Window]:
+    def push(self, accepted: Sequence[Accepted | None], host_ns: I64Array) -> Iterator[Window]:
         """Deliver a batch; yield every window that it closes.
 
-        arrivals: one a sensor; host_ns: (P,) receive times of the whole batch, by position.
+        accepted: one a sensor; host_ns: (P,) receive times of the whole batch, by position.
         """
-        accepted = self._accept(arrivals)
+        self._refuse_jumps(accepted)
         ranks, position = ranked(accepted)
         if not len(position):
             return
@@ -116,7 +113,7 @@ class Batcher:
         progress = self._advance(accepted, ranks, host_ns[position])
         for number, one in enumerate(accepted):
             if one is not None:
-                self._enqueue(number, one.packets, progress.watermark[:-1][ranks[number]])
+                self._enqueue(number, one, progress.watermark[:-1][ranks[number]])
         for track, newest_ns in zip(self._tracks, progress.newest[:, -1].tolist(), strict=True):
             track.newest_ns = newest_ns
         self._watermark = int(progress.watermark[-1])
@@ -217,31 +214,19 @@ class Batcher:
 
     # -- step 1: accept packets ---------------------------------------------------------------
 
-    def _accept(self, arrivals: Sequence[Arrival | None]) -> list[Accepted | None]:
-        """Packets that the intakes accept; ClockJump where clocks jump.
+    def _refuse_jumps(self, accepted: Sequence[Accepted | None]) -> None:
+        """Raise ClockJump where clocks jump.
 
         If several clocks jump together, the recording is cut at the first packet after any of the
         jumps, including a packet that is held for confirmation. Otherwise the cut would depend on
         how packets are grouped into batches.
         """
-        accepted: list[Accepted | None] = []
-        jumps: list[ClockJump] = []
-        for number, (track, arrival) in enumerate(zip(self._tracks, arrivals, strict=True)):
-            one = None
-            try:
-                if arrival is not None:
-                    one = track.intake.accept(arrival)
-                    for guard in self._guards[number : number + 1]:
-                        guard.check(one)
-            except ClockJump as jump:
-                jumps.append(jump)
-            accepted.append(one)
+        jumps = [one.jump for one in accepted if one is not None and one.jump is not None]
         if jumps:
             first = min(jumps, key=lambda jump: jump.host_ns)
             held_ns = [track.intake.held_host_ns for track in self._tracks]
             near_ns = [at for at in held_ns if at is not None and first.host_ns - at <= STEP_NS]
             raise ClockJump(str(first), min([first.host_ns, *near_ns]))
-        return accepted
 
     def _check_clocks(self, accepted: Sequence[Accepted | None], ranks: Sequence[I64Array]) -> None:
         """Record first stamps; ClockError if those of two sensors are not comparable."""
@@ -249,13 +234,12 @@ class Batcher:
         for number, (track, one) in enumerate(zip(self._tracks, accepted, strict=True)):
             if one is None or track.first_ns > NEVER:
                 continue
-            arrival = one.packets
-            measured = np.flatnonzero(arrival.headers.valid.any(axis=1))
+            measured = np.flatnonzero(one.newest_ns > NEVER)
             if len(measured):
                 row = int(measured[0])
-                column = int(np.argmax(arrival.headers.valid[row]))
-                track.first_ns = int(arrival.headers.stamp_ns[row, column])
-                track.offset_ns = track.first_ns - int(arrival.host_ns[row])
+                column = int(np.argmax(one.columns.valid[row]))
+                track.first_ns = int(one.columns.stamp_ns[row, column])
+                track.offset_ns = track.first_ns - int(one.host_ns[row])
                 firsts.append((int(ranks[number][row]), number))
         for _, number in sorted(firsts):
             refuse_incomparable(
@@ -322,68 +306,31 @@ class Batcher:
 
     # -- step 3: enqueue columns --------------------------------------------------------------
 
-    def _enqueue(self, number: int, arrival: Arrival, published: I64Array) -> None:
+    def _enqueue(self, number: int, accepted: Accepted, published: I64Array) -> None:
         """Queue the valid columns of a sensor that are not late.
 
-        published: (P,) watermark before each packet.
+        published: (A,) watermark before each packet.
         """
         track = self._tracks[number]
-        headers = arrival.headers
-        if arrival.is_rising and len(headers.stamp_ns):
-            low = headers.stamp_ns[:, 0]
-            first_ns = int(low[0])
-            if self._is_ahead(track, first_ns, int(headers.stamp_ns[-1, -1])) and (
-                # Neither array falls.
-                first_ns >= int(published[-1]) or bool((low >= published).all())
-            ):
-                track.decoded += headers.valid.size
-                self._wait(track, self._columns(arrival))
-                return
-        valid = headers.valid.reshape(-1)
-        count = int(np.count_nonzero(valid))
-        track.decoded += len(valid)
-        track.drop("invalid", len(valid) - count)
-        if not count:
-            return
-        columns = self._columns(arrival)
-        published = published.repeat(headers.valid.shape[1])
-        if count < len(valid):
-            columns = columns.take(valid)
-            published = published[valid]
-        if not self._is_in_time(track, columns.stamp_ns, int(published[-1])):
+        valid = accepted.columns.valid
+        track.decoded += valid.size
+        track.drop("invalid", accepted.invalid)
+        columns = Columns(
+            accepted.columns.stamp_ns.reshape(-1),
+            accepted.ring_index.reshape(-1),
+            accepted.columns.encoder.reshape(-1),
+        )
+        if accepted.invalid:
+            columns = columns.take(valid.reshape(-1))
+        wait_ns = self._policy.max_wait_ns
+        has_gap = wait_ns is not None and accepted.ahead_ns > wait_ns
+        may_be_late = accepted.behind_ns > SLACK_NS or bool((accepted.lowest_ns < published).any())
+        if has_gap or may_be_late:
+            published = published.repeat(valid.shape[1])[valid.reshape(-1)]
             columns = self._without_late(track, columns, published)
         if len(columns):
-            self._wait(track, columns)
-
-    @staticmethod
-    def _columns(arrival: Arrival) -> Columns:
-        """All columns of packets, valid or not."""
-        headers = arrival.headers
-        offsets = arrival.column_offsets
-        if offsets is None:
-            offsets = np.arange(headers.valid.shape[1])
-        ring_index = arrival.ring_index[:, None] + offsets
-        return Columns(
-            headers.stamp_ns.reshape(-1), ring_index.reshape(-1), headers.encoder.reshape(-1)
-        )
-
-    @staticmethod
-    def _wait(track: Track, columns: Columns) -> None:
-        track.waiting.append(columns)
-        track.oldest_ring_index = min(track.oldest_ring_index, int(columns.ring_index.min()))
-
-    def _is_ahead(self, track: Track, first_ns: int, last_ns: int) -> bool:
-        """True if columns with rising stamps come after all before, without a gap."""
-        wait_ns = self._policy.max_wait_ns
-        has_gap = wait_ns is not None and last_ns - track.newest_ns > wait_ns
-        return not has_gap and first_ns >= track.newest_ns - SLACK_NS
-
-    def _is_in_time(self, track: Track, stamp: I64Array, published: int) -> bool:
-        """True if no column can be late and none ends a gap: nearly all small batches."""
-        newest = max(track.newest_ns, int(stamp.max()))
-        wait_ns = self._policy.max_wait_ns
-        has_gap = wait_ns is not None and newest - track.newest_ns > wait_ns
-        return not has_gap and int(stamp.min()) >= max(newest - SLACK_NS, published)
+            track.waiting.append(columns)
+            track.oldest_ring_index = min(track.oldest_ring_index, accepted.oldest)
 
     def _without_late(self, track: Track, columns: Columns, published: I64Array) -> Columns:
         """The columns that are not late; published: (n,) watermark before each column."""
@@ -513,7 +460,7 @@ class Batcher:
 
 def ranked(accepted: Sequence[Accepted | None]) -> tuple[list[I64Array], I64Array]:
     """Order of delivery: per sensor the rank of each packet; and the positions of all, by rank."""
-    events = [_NONE if one is None else one.packets.position for one in accepted]
+    events = [_NONE if one is None else one.position for one in accepted]
     delivering = [number for number, event in enumerate(events) if len(event)]
     if len(delivering) == 1:
         return [np.arange(len(event)) for event in events], events[delivering[0]]

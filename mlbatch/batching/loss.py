@@ -7,6 +7,7 @@ sends nothing because its rotor passes a dark sector.
 
 from __future__ import annotations
 
+import ctypes
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -14,6 +15,7 @@ import numpy as np
 
 from mlbatch.arrays import BoolArray, F64Array, I64Array, U16Array, U32Array, median
 from mlbatch.lidar.geometry import rotor_ticks
+from mlbatch.native.library import Numbers, address, library
 from mlbatch.types import ColumnHeaders
 from mlbatch.units import NS_PER_S
 
@@ -21,98 +23,55 @@ from mlbatch.units import NS_PER_S
 class PacketLoss:
     """Lost and reordered packets of one sensor.
 
-    Zero for a sensor that has neither sequence numbers nor a known packet period.
+    Zero for a sensor that has neither sequence numbers nor a known packet period. numbers, gaps:
+    those that count; the intake counts numbers itself.
     """
 
     def __init__(self, modulus: int, packet_ns: float = 0.0) -> None:
         """modulus: of sequence numbers, 0: none; packet_ns: nominal packet period, 0: unknown."""
-        self._numbers = SequenceLoss(modulus)
-        self._gaps = GapLoss(packet_ns) if packet_ns and not modulus else None
+        self.numbers = SequenceLoss(modulus)
+        self.gaps = GapLoss(packet_ns) if packet_ns and not modulus else None
 
     @property
     def lost(self) -> int:
         """Packets missing between those received."""
-        return self._numbers.lost if self._gaps is None else self._gaps.lost
+        return self.numbers.lost if self.gaps is None else self.gaps.lost
 
     @property
     def reordered(self) -> int:
         """Packets received after a later one."""
-        return self._numbers.reordered if self._gaps is None else self._gaps.reordered
+        return self.numbers.reordered if self.gaps is None else self.gaps.reordered
 
     def add(self, sequence: I64Array, headers: ColumnHeaders, host_ns: I64Array) -> None:
         """Add accepted packets (P,) in order of receive time; stamps on the sensor's clock."""
-        if self._gaps is None:
-            self._numbers.add(sequence)
-        elif len(host_ns):
-            self._gaps.add(headers, host_ns)
-
-
-# -- by sequence numbers --------------------------------------------------------------------------
-
-# A longer step needs the next packet as confirmation: one flipped bit in a frame number must not
-# count as a million lost packets.
-BELIEVED_STEP = 1024
+        self.numbers.add(sequence)
+        if self.gaps is not None:
+            self.gaps.add(headers, host_ns)
 
 
 class SequenceLoss:
-    """Counts gaps and backward steps in sequence numbers that wrap at `modulus` (0: none)."""
+    """Counts gaps and backward steps in sequence numbers that wrap at `modulus` (0: none).
+
+    The rules: `native/intake.c`.
+    """
 
     def __init__(self, modulus: int) -> None:
-        self.lost = 0
-        self.reordered = 0
-        self._modulus = modulus
-        self._newest: int | None = None
-        # A number after a long step, until the next one confirms it.
-        self._doubtful: int | None = None
-        # False until a second number confirms the first, which may be the damaged one.
-        self._is_sure = False
+        self.struct = Numbers(modulus=modulus, newest=-1, doubtful=-1)
+
+    @property
+    def lost(self) -> int:
+        """Packets missing between those received."""
+        return int(self.struct.lost)
+
+    @property
+    def reordered(self) -> int:
+        """Packets received after a later one."""
+        return int(self.struct.reordered)
 
     def add(self, sequence: I64Array) -> None:
         """Add accepted packets (n,) in order of receive time; negative numbers are ignored."""
-        if not self._modulus or not len(sequence):
-            return
-        if self._is_sure and self._doubtful is None and self._is_consecutive(sequence):
-            self._newest = int(sequence[-1])
-            return
-        for number in sequence[sequence >= 0].tolist():
-            if self._newest is None:
-                self._newest = number
-            else:
-                self._step(number)
-
-    def _is_consecutive(self, sequence: I64Array) -> bool:
-        """True if every number is its predecessor plus one, the usual case."""
-        if self._newest is None or int(sequence[0]) != (self._newest + 1) % self._modulus:
-            return False
-        return len(sequence) == 1 or bool(
-            (sequence[1:] == (sequence[:-1] + 1) % self._modulus).all()
-        )
-
-    def _step(self, number: int) -> None:
-        step = self._signed(number - (self._newest or 0))
-        if abs(step) > BELIEVED_STEP:
-            if self._doubtful is None or abs(self._signed(number - self._doubtful)) > BELIEVED_STEP:
-                self._doubtful = number
-                return
-            # A long gap forward is loss; a step back is a restart of the count.
-            if step > 0 and self._is_sure:
-                self.lost += step - 2
-            self._newest = number
-            self._doubtful = None
-            self._is_sure = True
-            return
-        self._doubtful = None
-        self._is_sure = True
-        if step > 0:
-            self.lost += step - 1
-            self._newest = number
-        elif step < 0:
-            self.reordered += 1
-            self.lost = max(0, self.lost - 1)
-
-    def _signed(self, step: int) -> int:
-        half = self._modulus // 2
-        return (step + half) % self._modulus - half
+        numbers = np.ascontiguousarray(sequence, np.int64)
+        library().mlbatch_numbers(ctypes.byref(self.struct), len(numbers), address(numbers))
 
 
 # -- by gaps in the stamps ------------------------------------------------------------------------
@@ -204,7 +163,10 @@ class GapLoss:
         return self._lost + _missing(self._parts[0], self._packet_ns)
 
     def add(self, headers: ColumnHeaders, host_ns: I64Array) -> None:
-        """Add accepted packets (P,) in order of receive time; stamps on the sensor's clock."""
+        """Add accepted packets (P,) in order of receive time.
+
+        Of the stamps, on the sensor's clock, only the first of each packet are read.
+        """
         measured = np.flatnonzero(headers.valid.any(axis=1))
         packets = _Packets(
             # A copy, so that the stamps of all columns are not kept in memory.

@@ -8,8 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from mlbatch.arrays import I64Array, U8Array, U64Array
-from mlbatch.lidar.headers import Headers
-from mlbatch.lidar.interface import Lidar, Records
+from mlbatch.lidar.interface import Records
 from mlbatch.native.arena import PacketArena
 from mlbatch.native.capture import CaptureLoops
 
@@ -25,20 +24,14 @@ class KeptPackets(NamedTuple):
 class PacketRing:
     """Packets of one sensor in an arena; a ring index is the place of a column there.
 
-    A packet that was not read into the arena is copied to it. Only the bytes of headers are
-    gathered, for the lidar to read. One thread may `keep` while others read a `view` at ring
-    indexes that are still needed.
+    A packet that was not read into the arena is copied to it. One thread may `keep` while others
+    read a `view` at ring indexes that are still needed.
     """
 
-    def __init__(
-        self, packet_size: int, records: Records, header_bytes: I64Array, arena: PacketArena
-    ) -> None:
-        """header_bytes: (k, 2), as `Lidar.header_bytes`."""
+    def __init__(self, packet_size: int, records: Records, arena: PacketArena) -> None:
         self._size = packet_size
-        self._header_bytes = header_bytes
         self._arena = arena
         self._records = records
-        self._headers: U8Array = np.zeros((0, packet_size), np.uint8)
         self._loops = CaptureLoops()
         self._view = self._viewed()
         # Of the last call.
@@ -73,13 +66,6 @@ class PacketRing:
             self._view = self._viewed()
         return self._view[:2]
 
-    def store(
-        self, data: U8Array, start: I64Array, place: int | None = None
-    ) -> tuple[U8Array, I64Array]:
-        """Keep packets; return their headers, see `packets`, and first ring indexes (P,)."""
-        kept = self.keep(data, start, place)
-        return self.packets(kept), kept.ring_index
-
     def keep(self, data: U8Array, start: I64Array, place: int | None = None) -> KeptPackets:
         """Keep packets until the arena frees them; data, start, place: as in `PacketBatch`."""
         if place is None:
@@ -88,18 +74,6 @@ class PacketRing:
         if self._has_sums and len(start):
             self._add_sums(kept)
         return kept
-
-    def packets(self, kept: KeptPackets) -> U8Array:
-        """Return (P, packet_size), valid until the next call.
-
-        Only the bytes of headers are those of the packets; the others are any.
-        """
-        count = len(kept.start)
-        if count > len(self._headers):
-            self._headers = np.zeros((2 * count, self._size), np.uint8)
-        headers = self._headers[:count]
-        self._loops.gather(kept.data, kept.start, self._header_bytes, headers)
-        return headers
 
     def keep_sums(self) -> None:
         """Sum packets from now on, for `sum_until`."""
@@ -140,22 +114,3 @@ class PacketRing:
             strides=(1, 1),
         )
         return pieces, self._arena.origin, data
-
-
-def headers_of(
-    lidar: Lidar, ring: PacketRing, kept: KeptPackets, host_ns: I64Array, keys: I64Array | None
-) -> Headers:
-    """Headers of packets that a ring has kept last, received at host_ns (P,).
-
-    keys: (P,) hashes of their contents, None: not known.
-    """
-    if lidar.reader is not None:
-        return lidar.reader.read(kept.data, kept.start, host_ns, keys)
-    packets = ring.packets(kept)
-    return Headers(
-        lidar.sent_by_me(packets),
-        lidar.faults(packets),
-        lidar.sequence(packets),
-        lidar.column_headers(packets, host_ns),
-        is_usual=False,
-    )

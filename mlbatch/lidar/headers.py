@@ -17,7 +17,7 @@ import numpy.typing as npt
 
 from mlbatch.arrays import BoolArray, F64Array, I64Array, U8Array
 from mlbatch.lidar.content_keys import hash_factors
-from mlbatch.native.library import address, library
+from mlbatch.native.library import Reader, address, library
 from mlbatch.types import ColumnHeaders
 
 # As in `headers.c`.
@@ -208,14 +208,13 @@ class Headers(NamedTuple):
     faults: U8Array  # indices into FAULTS
     key: I64Array  # as `Lidar.sequence`
     columns: ColumnHeaders
-    # All packets are the sensor's and good, their columns valid, and no stamp falls.
-    is_usual: bool
 
 
 class HeaderReader:
     """Reads the headers of a sensor's packets.
 
-    wrong_crc: which packets (P, size) have a wrong checksum; None: checksums are not read.
+    wrong_crc: which packets (P, size) have a wrong checksum; None: checksums are not read, so that
+    compiled loops may use `struct` alone.
     """
 
     def __init__(
@@ -228,14 +227,19 @@ class HeaderReader:
         """has_number: packets have a number of their own; else it is the hash of the content."""
         self.table = table
         self.columns = table.columns * (table.rows if isinstance(table, TimedRows) else 1)
+        self.wrong_crc = wrong_crc
         self._size = table.packet_bytes
-        self._kind = _KINDS.index(type(table))
-        self._has_number = has_number
-        self._wrong_crc = wrong_crc
         self._odd = hash_factors(table.packet_bytes // _KEY_WORD)
         self._arrays: list[npt.NDArray[Any]] = []
         self._layout = self._struct(table)
-        self._function = library().mlbatch_headers
+        self.struct = Reader(
+            kind=_KINDS.index(type(table)),
+            layout=ctypes.addressof(self._layout),
+            packet_bytes=table.packet_bytes,
+            columns=self.columns,
+            has_number=has_number,
+            odd=address(self._odd),
+        )
 
     def read(
         self, data: U8Array, start: I64Array, host_ns: I64Array, keys: I64Array | None = None
@@ -245,38 +249,39 @@ class HeaderReader:
         keys: (P,) hashes of their contents, None: not known.
         """
         count = len(start)
-        if count and (int(start.min()) < 0 or int(start.max()) + self._size > len(data)):
-            raise IndexError("packets outside of their array")
+        self.refuse_outside(data, start)
         start = np.ascontiguousarray(start)
         host_ns = np.ascontiguousarray(host_ns)
         keys = None if keys is None else np.ascontiguousarray(keys)
         shape = (count, self.columns)
-        is_mine = np.empty(count, np.bool_)
-        faults = np.empty(count, np.uint8)
-        key = np.empty(count, np.int64)
-        stamp_ns = np.empty(shape, np.int64)
-        encoder = np.empty(shape, np.int64)
-        valid = np.empty(shape, np.bool_)
-        is_usual = self._function(
-            self._kind,
-            ctypes.addressof(self._layout),
+        found = Headers(
+            np.empty(count, np.bool_),
+            np.empty(count, np.uint8),
+            np.empty(count, np.int64),
+            ColumnHeaders(
+                np.empty(shape, np.int64), np.empty(shape, np.int64), np.empty(shape, np.bool_)
+            ),
+        )
+        columns = found.columns
+        library().mlbatch_headers(
+            ctypes.byref(self.struct),
             address(data),
             count,
             address(start),
-            self._size,
-            self.columns,
             address(host_ns),
-            self._has_number,
-            address(self._odd),
             None if keys is None else address(keys),
-            *map(address, (is_mine, faults, key, stamp_ns, encoder, valid)),
+            *map(address, (found.is_mine, found.faults, found.key)),
+            *map(address, (columns.stamp_ns, columns.encoder, columns.valid)),
         )
-        columns = ColumnHeaders(stamp_ns, encoder, valid)
-        if self._wrong_crc is not None:
+        if self.wrong_crc is not None:
             packets = data[start[:, None] + np.arange(self._size)]
-            faults[(faults == 0) & self._wrong_crc(packets)] = _BAD_CRC
-            is_usual = is_usual and not faults.any()
-        return Headers(is_mine, faults, key, columns, bool(is_usual) and count > 0)
+            found.faults[(found.faults == 0) & self.wrong_crc(packets)] = _BAD_CRC
+        return found
+
+    def refuse_outside(self, data: U8Array, start: I64Array) -> None:
+        """Raise IndexError unless all packets are within `data`."""
+        if len(start) and (int(start.min()) < 0 or int(start.max()) + self._size > len(data)):
+            raise IndexError("packets outside of their array")
 
     def read_rows(self, packets: U8Array, host_ns: I64Array | None = None) -> Headers:
         """Read packets (P, size or more), received at host_ns (P,), None: any time."""

@@ -173,11 +173,6 @@ class Lidar(Protocol):
     notes: tuple[str, ...]
 
     @property
-    def header_bytes(self) -> I64Array:
-        """All that is read of packets but pixels: (k, 2), first byte and number of bytes."""
-        ...
-
-    @property
     def columns_per_s(self) -> float:
         """Columns sent in a second, while it measures and without loss; 0: unknown."""
         ...

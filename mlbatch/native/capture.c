@@ -540,20 +540,6 @@ EXPORT void mlbatch_copy(int64_t runs, const uint8_t *source, const int64_t *sou
         memmove(target + target_at[run], source + source_at[run], (size_t)bytes[run]);
 }
 
-/* Copy the bytes of ranges (ranges, 2: first byte, bytes) of packets to the same bytes of the rows
-   of `out`, row_bytes apart. */
-EXPORT void mlbatch_gather(int64_t packets, const uint8_t *data, const int64_t *start,
-                           int64_t range_count, const int64_t *ranges, int64_t row_bytes,
-                           uint8_t *out)
-{
-    for (int64_t packet = 0; packet < packets; packet++, out += row_bytes) {
-        const uint8_t *from = data + start[packet];
-        for (int64_t range = 0; range < range_count; range++)
-            memcpy(out + ranges[2 * range], from + ranges[2 * range],
-                   (size_t)ranges[2 * range + 1]);
-    }
-}
-
 static uint64_t word8(const uint8_t *at)
 {
     uint64_t value;

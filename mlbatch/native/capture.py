@@ -62,28 +62,6 @@ class CaptureLoops:
             address(at_byte),
         )
 
-    def gather(self, data: U8Array, start: I64Array, ranges: I64Array, out: U8Array) -> None:
-        """Copy ranges (k, 2), first byte and bytes, of packets to the same bytes of rows of `out`.
-
-        start: (n,) of the packets in `data`; out: (n, bytes of a packet).
-        """
-        if not len(start):
-            return
-        start, ranges = map(np.ascontiguousarray, (start, ranges))
-        size = out.shape[1]
-        is_wrong = int(start.min()) < 0 or int(start.max()) + size > len(data)
-        if is_wrong or int(ranges.min()) < 0 or int(ranges.sum(axis=1).max()) > size:
-            raise IndexError("packets outside of their array")
-        self._library.mlbatch_gather(
-            len(start),
-            address(data),
-            address(start),
-            len(ranges),
-            address(ranges),
-            size,
-            address(out),
-        )
-
     def sums(self, data: U8Array, start: I64Array, size: int) -> U64Array:
         """Return the checksums (n,) of packets of a size: sums of their 64-bit words, modulo 2^64.
 

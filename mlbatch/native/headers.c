@@ -14,9 +14,7 @@
 #define PREFETCH(from) ((void)(from))
 #endif
 
-enum { AHEAD = 2, MOST_BLOCKS = 64 };
-/* Index in `lidar.interface.FAULTS`. */
-enum { GOOD = 0, BAD_HEADER = 2 };
+enum { MOST_BLOCKS = 64 };
 enum { NS_PER_US = 1000 };
 #define NS_PER_S INT64_C(1000000000)
 #define S_PER_DAY INT64_C(86400)
@@ -27,17 +25,6 @@ typedef struct {
     int64_t bytes;
     int64_t value;
 } Check;
-
-/* A packet as it is read: the header of packets that are not good is any. */
-typedef struct {
-    int64_t is_mine; /* it has the serial number of the sensor, or none */
-    int64_t fault;   /* GOOD or BAD_HEADER */
-    int64_t key;     /* as `Lidar.sequence` */
-    /* Of its columns. */
-    int64_t *stamp_ns;
-    int64_t *encoder;
-    uint8_t *valid;
-} Header;
 
 static inline int64_t number_at(const uint8_t *from, int64_t bytes)
 {
@@ -66,22 +53,6 @@ static int has_values(const uint8_t *packet, int64_t count, const Check *checks)
         if (number_at(packet + check->first, check->bytes) != check->value)
             return 0;
     return 1;
-}
-
-static inline int64_t floor_divide(int64_t value, int64_t divisor)
-{
-    return value / divisor - (value % divisor < 0);
-}
-
-static inline int64_t floor_modulo(int64_t value, int64_t divisor)
-{
-    return value - floor_divide(value, divisor) * divisor;
-}
-
-/* Wraps instead of overflowing: numbers of damaged packets are any. */
-static inline int64_t sum(int64_t one, int64_t other)
-{
-    return (int64_t)((uint64_t)one + (uint64_t)other);
 }
 
 /* To the nearest integer, halves to the even one; below 2**51. */
@@ -606,47 +577,48 @@ static void read_even(const EvenColumns *layout, const uint8_t *packet, Header *
 /* As in `lidar/headers.py`. */
 enum { STAMPED, PACED, DATED, TIMED, EVEN };
 
-/* Read the headers of packets in any order and state.
-
-   key: the hash of the content where packets have no number of their own; keys: the hashes, where
-   they are known, or NULL. stamp_ns, encoder, valid: (packets, columns of a packet). Return 1 if
-   all are good packets of this sensor, with valid columns only, whose stamps do not fall. */
-EXPORT int64_t mlbatch_headers(int64_t kind, const void *layout, const uint8_t *data,
-                               int64_t packets, const int64_t *start, int64_t packet_bytes,
-                               int64_t columns, const int64_t *host_ns, int64_t has_number,
-                               const uint64_t *odd, const int64_t *keys, uint8_t *is_mine,
-                               uint8_t *fault, int64_t *key, int64_t *stamp_ns, int64_t *encoder,
-                               uint8_t *valid)
+void mlbatch_read_header(const Reader *reader, const uint8_t *packet, const uint8_t *later,
+                         int64_t host_ns, const int64_t *content_key, Header *header)
 {
-    int64_t newest = INT64_MIN, is_usual = 1;
-    const int64_t step = packet_bytes / columns;
-    const int64_t first = kind == STAMPED ? ((const StampedColumns *)layout)->first_column : 0;
+    const void *layout = reader->layout;
+    if (later) {
+        const int64_t step = reader->packet_bytes / reader->columns;
+        if (reader->kind == STAMPED)
+            later += ((const StampedColumns *)layout)->first_column;
+        for (int64_t column = 0; column < reader->columns; column++)
+            PREFETCH(later + column * step);
+    }
+    header->is_mine = 1;
+    header->fault = GOOD;
+    header->key = 0;
+    switch (reader->kind) {
+    case STAMPED: read_stamped(layout, packet, header); break;
+    case PACED: read_paced(layout, packet, host_ns, header); break;
+    case DATED: read_dated(layout, packet, header); break;
+    case TIMED: read_timed(layout, packet, header); break;
+    default: read_even(layout, packet, header);
+    }
+    if (!reader->has_number)
+        header->key = content_key ? *content_key
+                                  : mlbatch_content_key(packet, reader->packet_bytes, reader->odd);
+}
+
+/* Read the headers of packets in any order and state; keys: see `mlbatch_read_header`, or NULL.
+   stamp_ns, encoder, valid: (packets, columns of a packet). */
+EXPORT void mlbatch_headers(const Reader *reader, const uint8_t *data, int64_t packets,
+                            const int64_t *start, const int64_t *host_ns, const int64_t *keys,
+                            uint8_t *is_mine, uint8_t *fault, int64_t *key, int64_t *stamp_ns,
+                            int64_t *encoder, uint8_t *valid)
+{
     for (int64_t number = 0; number < packets; number++) {
-        const uint8_t *packet = data + start[number];
-        if (number + AHEAD < packets)
-            for (int64_t column = 0; column < columns; column++)
-                PREFETCH(data + start[number + AHEAD] + first + column * step);
-        Header header = {1, GOOD, 0, stamp_ns, encoder, valid};
-        switch (kind) {
-        case STAMPED: read_stamped(layout, packet, &header); break;
-        case PACED: read_paced(layout, packet, host_ns[number], &header); break;
-        case DATED: read_dated(layout, packet, &header); break;
-        case TIMED: read_timed(layout, packet, &header); break;
-        default: read_even(layout, packet, &header);
-        }
-        if (!has_number)
-            header.key = keys ? keys[number] : mlbatch_content_key(packet, packet_bytes, odd);
+        const int64_t first = number * reader->columns;
+        Header header = {0, 0, 0, stamp_ns + first, encoder + first, valid + first};
+        const int64_t later = number + HEADERS_AHEAD;
+        mlbatch_read_header(reader, data + start[number],
+                            later < packets ? data + start[later] : NULL, host_ns[number],
+                            keys ? keys + number : NULL, &header);
         is_mine[number] = (uint8_t)header.is_mine;
         fault[number] = (uint8_t)header.fault;
         key[number] = header.key;
-        is_usual &= header.is_mine & (header.fault == GOOD);
-        for (int64_t column = 0; column < columns; column++) {
-            is_usual &= valid[column] & (stamp_ns[column] >= newest);
-            newest = stamp_ns[column];
-        }
-        stamp_ns += columns;
-        encoder += columns;
-        valid += columns;
     }
-    return is_usual;
 }

@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from mlbatch.native import library_path
 
-_ABI = 15
+_ABI = 16
 _WORD = ctypes.c_int64
 _ADDRESS = ctypes.c_void_p
 _NUMBER = ctypes.c_double
@@ -25,15 +25,13 @@ _FUNCTIONS: dict[str, tuple[type[Any], ...]] = {
     "mlbatch_angles": (_WORD, _ADDRESS, _ADDRESS, _ADDRESS),
     "mlbatch_merge": (_WORD, _ADDRESS, _WORD, *[_ADDRESS] * 5),
     "mlbatch_figures": (_WORD, *[_ADDRESS] * 4, _WORD, _ADDRESS, _WORD, _ADDRESS, _ADDRESS),
-    "mlbatch_headers": (
-        *(_WORD, _ADDRESS, _ADDRESS, _WORD, _ADDRESS, _WORD, _WORD, _ADDRESS, _WORD),
-        *[_ADDRESS] * 8,
-    ),
+    "mlbatch_headers": (_ADDRESS, _ADDRESS, _WORD, *[_ADDRESS] * 9),
+    "mlbatch_numbers": (_ADDRESS, _WORD, _ADDRESS),
+    "mlbatch_take": (_ADDRESS, _ADDRESS, _ADDRESS),
     "mlbatch_walk": (_ADDRESS, *[_WORD] * 6, _ADDRESS, _ADDRESS),
     "mlbatch_dissect": (_ADDRESS, _ADDRESS, _WORD, _WORD, *[_ADDRESS] * 5),
     "mlbatch_keep": (_ADDRESS, _ADDRESS, _WORD, _ADDRESS, _WORD),
     "mlbatch_copy": (_WORD, *[_ADDRESS] * 5),
-    "mlbatch_gather": (_WORD, _ADDRESS, _ADDRESS, _WORD, _ADDRESS, _WORD, _ADDRESS),
     "mlbatch_sums": (_WORD, _ADDRESS, _ADDRESS, _WORD, _ADDRESS),
     "mlbatch_cloud_points": (
         *(_WORD, _ADDRESS, _WORD, _ADDRESS, _ADDRESS, _WORD),
@@ -57,7 +55,8 @@ _FUNCTIONS: dict[str, tuple[type[Any], ...]] = {
 _WITHOUT_RESULT = (
     "mlbatch_pack",
     "mlbatch_copy",
-    "mlbatch_gather",
+    "mlbatch_headers",
+    "mlbatch_numbers",
     "mlbatch_sums",
     "mlbatch_cloud_pack",
     "mlbatch_figures",
@@ -220,6 +219,107 @@ class Part(ctypes.Structure):
         ("stamp_ns", _ADDRESS),
         ("ring_index", _ADDRESS),
         ("encoder", _ADDRESS),
+    ]
+
+
+class Reader(ctypes.Structure):
+    """How the headers of a sensor's packets are read."""
+
+    _fields_: ClassVar = [
+        ("kind", _WORD),
+        ("layout", _ADDRESS),
+        ("packet_bytes", _WORD),
+        ("columns", _WORD),
+        ("has_number", _WORD),
+        ("odd", _ADDRESS),
+    ]
+
+
+class Numbers(ctypes.Structure):
+    """Sequence numbers of the packets of a sensor."""
+
+    _fields_: ClassVar = [
+        ("modulus", _WORD),
+        ("newest", _WORD),
+        ("doubtful", _WORD),
+        ("is_sure", _WORD),
+        ("lost", _WORD),
+        ("reordered", _WORD),
+    ]
+
+
+class Intake(ctypes.Structure):
+    """The intake of a sensor, from batch to batch."""
+
+    _fields_: ClassVar = [
+        ("reader", _ADDRESS),
+        ("columns", _WORD),
+        ("offsets", _ADDRESS),
+        ("numbers", _ADDRESS),
+        ("offset_ns", _WORD),
+        ("by_host", _WORD),
+        ("finds_jumps", _WORD),
+        ("takes_all", _WORD),
+        ("rejected", _ADDRESS),
+        ("renumbered", _WORD),
+        ("packets", _WORD),
+        ("recent", _ADDRESS),
+        ("heads", _ADDRESS),
+        ("newest_ns", _WORD),
+        ("newest_host_ns", _WORD),
+        ("delivered_ns", _WORD),
+        ("is_held", _WORD),
+        ("held_host_ns", _WORD),
+        ("held_key", _WORD),
+        ("held_ring_index", _WORD),
+        ("held_stamp_ns", _ADDRESS),
+        ("held_encoder", _ADDRESS),
+        ("held_valid", _ADDRESS),
+    ]
+
+
+class Arrival(ctypes.Structure):
+    """Packets of a sensor in a batch."""
+
+    _fields_: ClassVar = [
+        ("packets", _WORD),
+        ("data", _ADDRESS),
+        ("start", _ADDRESS),
+        ("position", _ADDRESS),
+        ("host_ns", _ADDRESS),
+        ("ring_index", _ADDRESS),
+        ("keys", _ADDRESS),
+        ("owned", _ADDRESS),
+        ("is_read", _WORD),
+        ("is_mine", _ADDRESS),
+        ("faults", _ADDRESS),
+        ("given_keys", _ADDRESS),
+    ]
+
+
+class Accepted(ctypes.Structure):
+    """Accepted packets of a sensor in a batch."""
+
+    _fields_: ClassVar = [
+        ("position", _ADDRESS),
+        ("host_ns", _ADDRESS),
+        ("newest_ns", _ADDRESS),
+        ("lowest_ns", _ADDRESS),
+        ("sensor_ns", _ADDRESS),
+        ("stamp_ns", _ADDRESS),
+        ("encoder", _ADDRESS),
+        ("ring_index", _ADDRESS),
+        ("valid", _ADDRESS),
+        ("read", _WORD),
+        ("packets", _WORD),
+        ("invalid", _WORD),
+        ("oldest", _WORD),
+        ("behind_ns", _WORD),
+        ("ahead_ns", _WORD),
+        ("before_ns", _WORD),
+        ("after_ns", _WORD),
+        ("before_host_ns", _WORD),
+        ("after_host_ns", _WORD),
     ]
 
 

@@ -16,7 +16,7 @@
 #endif
 
 /* To be changed with every change of a struct or of a signature. */
-#define MLBATCH_ABI 15
+#define MLBATCH_ABI 16
 
 #if defined(_WIN32)
 #define EXPORT __declspec(dllexport)
@@ -325,6 +325,148 @@ typedef struct {
     int64_t *settled;     /* of inherited sets: a reason, -1: open */
 } Dissection;
 
+static inline int64_t floor_divide(int64_t value, int64_t divisor)
+{
+    return value / divisor - (value % divisor < 0);
+}
+
+static inline int64_t floor_modulo(int64_t value, int64_t divisor)
+{
+    return value - floor_divide(value, divisor) * divisor;
+}
+
+/* Wraps instead of overflowing: numbers of damaged packets are any. */
+static inline int64_t sum(int64_t one, int64_t other)
+{
+    return (int64_t)((uint64_t)one + (uint64_t)other);
+}
+
+static inline int64_t difference(int64_t one, int64_t other)
+{
+    return (int64_t)((uint64_t)one - (uint64_t)other);
+}
+
+/* How the headers of a sensor's packets are read: `lidar/headers.py`, HeaderReader. */
+typedef struct {
+    int64_t kind;
+    const void *layout;
+    int64_t packet_bytes;
+    int64_t columns;
+    int64_t has_number;
+    const uint64_t *odd; /* factors of the hash of a content */
+} Reader;
+
+/* Verdicts on packets: those of `lidar.interface.FAULTS`, then those of `intake.c`. */
+enum { GOOD, BAD_SIZE, BAD_HEADER, BAD_CRC, DUPLICATE, BAD_STAMP, VERDICTS };
+
+/* The header of a packet; that of a packet that is not good is any. */
+typedef struct {
+    int64_t is_mine; /* it has the serial number of the sensor, or none */
+    int64_t fault;   /* GOOD or BAD_HEADER */
+    int64_t key;     /* as `Lidar.sequence` */
+    /* Of its columns. */
+    int64_t *stamp_ns;
+    int64_t *encoder;
+    uint8_t *valid;
+} Header;
+
+/* Packets between one that is read and one whose headers are fetched into the cache. */
+enum { HEADERS_AHEAD = 2 };
+
+/* Read a packet that was received at `host_ns`. later: a packet that will be read soon, or NULL;
+   content_key: its hash if it is known, or NULL. */
+void mlbatch_read_header(const Reader *reader, const uint8_t *packet, const uint8_t *later,
+                         int64_t host_ns, const int64_t *content_key, Header *header);
+
+/* Sequence numbers of the packets of a sensor, which wrap: `batching/loss.py`. */
+typedef struct {
+    int64_t modulus;  /* 0: there are none */
+    int64_t newest;   /* -1: none so far */
+    int64_t doubtful; /* a number after a long step, until the next one confirms it; -1: none */
+    int64_t is_sure;  /* a second number has confirmed the first, which may be a damaged one */
+    int64_t lost;
+    int64_t reordered;
+} Numbers;
+
+/* A packet is a duplicate if its key is that of one of so many packets before it: captures of
+   bridged ports repeat packets within milliseconds, a 16-bit frame number repeats after hours. */
+enum { DUPLICATE_REACH = 1024, KEY_HEADS = 2048 };
+
+/* What ends a call early: steps of a clock. */
+enum { NO_EVENT, RESET, JUMP };
+
+/* The intake of a sensor, from batch to batch: `batching/intake.py`. */
+typedef struct {
+    const Reader *reader; /* NULL: all headers are given */
+    int64_t columns;
+    const int64_t *offsets; /* (columns,): ring index of a column after that of its packet */
+    Numbers *numbers;
+    int64_t offset_ns; /* added to stamps */
+    int64_t by_host;   /* stamps are replaced by receive times */
+    int64_t finds_jumps;
+    int64_t takes_all; /* neither duplicates nor steps are looked for */
+    int64_t *rejected; /* (VERDICTS,) */
+    int64_t renumbered; /* duplicates with another first stamp */
+    /* The newest packets (DUPLICATE_REACH, 3), by number modulo DUPLICATE_REACH: key, first stamp,
+       and number of the one before whose key has the same hash; by hash, number of the newest. */
+    int64_t packets;
+    int64_t *recent;
+    int64_t *heads; /* (KEY_HEADS,) */
+    int64_t newest_ns;      /* of accepted packets, on the clock of the sensor; NEVER: none */
+    int64_t newest_host_ns; /* receive time of the accepted packet before */
+    int64_t delivered_ns;   /* newest stamp as it is batched */
+    /* The packet that is held until the next one. */
+    int64_t is_held;
+    int64_t held_host_ns;
+    int64_t held_key;
+    int64_t held_ring_index;
+    int64_t *held_stamp_ns; /* (columns,) */
+    int64_t *held_encoder;
+    uint8_t *held_valid;
+} Intake;
+
+/* Packets of a sensor in a batch, in order of receive time. */
+typedef struct {
+    int64_t packets;
+    const uint8_t *data;
+    const int64_t *start;      /* first bytes */
+    const int64_t *position;   /* in the batch */
+    const int64_t *host_ns;
+    const int64_t *ring_index; /* of the first columns */
+    const int64_t *keys;       /* hashes of the contents, or NULL */
+    uint8_t *owned;            /* by position: which packets of the batch have a sensor */
+    /* Headers that were read before, if `is_read`; those of columns are in rows of `Accepted`. */
+    int64_t is_read;
+    const uint8_t *is_mine;
+    const uint8_t *faults;
+    const int64_t *given_keys;
+} Arrival;
+
+/* Accepted packets, in order of delivery; rows of C columns. There is room for one packet more than
+   arrive, and given headers are in all rows but the first. */
+typedef struct {
+    int64_t *position;
+    int64_t *host_ns;
+    int64_t *newest_ns; /* largest valid stamp, NEVER without one */
+    int64_t *lowest_ns; /* smallest valid stamp, FOREVER without one */
+    int64_t *sensor_ns; /* first stamp on the clock of the sensor */
+    int64_t *stamp_ns;
+    int64_t *encoder;
+    int64_t *ring_index;
+    uint8_t *valid;
+    int64_t read;      /* packets of the sensor, good or not */
+    int64_t packets;   /* accepted ones */
+    int64_t invalid;   /* columns */
+    int64_t oldest;    /* smallest ring index */
+    int64_t behind_ns; /* longest time of a column behind the newest stamp before it */
+    int64_t ahead_ns;  /* longest step of the newest stamp */
+    /* Of an event: the stamps around the step, and the receive times. */
+    int64_t before_ns;
+    int64_t after_ns;
+    int64_t before_host_ns;
+    int64_t after_host_ns;
+} Accepted;
+
 /* Hash of a packet: `lidar/content_keys.py`. */
 static inline int64_t mlbatch_content_key(const uint8_t *packet, int64_t bytes,
                                           const uint64_t *odd)
@@ -355,12 +497,12 @@ EXPORT void mlbatch_figures(int64_t windows, const int64_t *ends, const int64_t 
                             const int64_t *sensor, const int64_t *encoder, int64_t sensors,
                             const int64_t *positions, int64_t sectors, int64_t *entered,
                             int64_t *figures);
-EXPORT int64_t mlbatch_headers(int64_t kind, const void *layout, const uint8_t *data,
-                               int64_t packets, const int64_t *start, int64_t packet_bytes,
-                               int64_t columns, const int64_t *host_ns, int64_t has_number,
-                               const uint64_t *odd, const int64_t *keys, uint8_t *is_mine,
-                               uint8_t *fault, int64_t *key, int64_t *stamp_ns, int64_t *encoder,
-                               uint8_t *valid);
+EXPORT void mlbatch_headers(const Reader *reader, const uint8_t *data, int64_t packets,
+                            const int64_t *start, const int64_t *host_ns, const int64_t *keys,
+                            uint8_t *is_mine, uint8_t *fault, int64_t *key, int64_t *stamp_ns,
+                            int64_t *encoder, uint8_t *valid);
+EXPORT void mlbatch_numbers(Numbers *numbers, int64_t packets, const int64_t *sequence);
+EXPORT int64_t mlbatch_take(Intake *intake, const Arrival *arrival, Accepted *out);
 EXPORT int64_t mlbatch_walk(const uint8_t *data, int64_t begin, int64_t end, int64_t is_swapped,
                             int64_t unit_ns, int64_t most_bytes, int64_t room, int64_t *columns,
                             int64_t *stop);
@@ -372,9 +514,6 @@ EXPORT int64_t mlbatch_keep(Dissection *all, const uint8_t *data, int64_t copies
                             int64_t used);
 EXPORT void mlbatch_copy(int64_t runs, const uint8_t *source, const int64_t *source_at,
                          const int64_t *bytes, uint8_t *target, const int64_t *target_at);
-EXPORT void mlbatch_gather(int64_t packets, const uint8_t *data, const int64_t *start,
-                           int64_t range_count, const int64_t *ranges, int64_t row_bytes,
-                           uint8_t *out);
 EXPORT void mlbatch_sums(int64_t packets, const uint8_t *data, const int64_t *start, int64_t bytes,
                          uint64_t *sums);
 EXPORT int64_t mlbatch_cloud_points(int64_t count, const uint8_t *rows, int64_t step,

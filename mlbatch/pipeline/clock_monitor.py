@@ -10,7 +10,7 @@ from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING
 
 from mlbatch.arrays import I64Array
-from mlbatch.batching.intake import NEVER, JumpGuard, extremes
+from mlbatch.batching.intake import Intake
 from mlbatch.clocks.compare import Comparison, compare
 from mlbatch.clocks.watch import ClockEstimate
 from mlbatch.discovery.router import Router
@@ -30,24 +30,12 @@ _WARNINGS = {"host": "host_step"}
 
 
 class ClockMonitor:
-    """Maps and watches the clocks of the sensors of a run.
-
-    guards: for the batcher, one a sensor; they feed the watches and raise at clock steps.
-    """
+    """Maps and watches the clocks of the sensors of a run."""
 
     def __init__(self, sensors: Sequence[Sensor], replay: FaultReplay | None) -> None:
         """replay: of injected faults, None without."""
         self._sensors = sensors
         self._replay = replay
-        self.guards = [
-            JumpGuard(
-                sensor.name,
-                # Delays cannot be measured where packets share the log time of a message.
-                sensor.clock.watch if sensor.clock.has_receive_times else None,
-                has_clock=not sensor.clock.by_host,
-            )
-            for sensor in sensors
-        ]
 
     def map_stamps(self, sensor: Sensor, stamp_ns: I64Array, host_ns: I64Array) -> I64Array:
         """Timestamps (P, C) of packets received at (P,) as they are to be batched."""
@@ -67,17 +55,16 @@ class ClockMonitor:
         arena = PacketArena()
         sensors = [sensor.unread(arena) for sensor in self._sensors]
         watches = [clock_watch(sensor.lidar) for sensor in sensors]
-        ingest = Ingest(router, sensors, self.map_stamps)
+        intakes = [
+            Intake(sensor.name, sensor.column_offsets, takes_all=True, watch=watch)
+            for sensor, watch in zip(sensors, watches, strict=True)
+        ]
+        ingest = Ingest(router, sensors, intakes, self.map_stamps)
         if self._replay is not None:
             batches = self._replay.batches(batches, ingest.owners)
         for batch in batches:
             arena.keep_from(None)
-            arrivals = ingest.columns(batch).arrivals
-            for arrival, watch in zip(arrivals, watches, strict=True):
-                if arrival is not None:
-                    _, newest_ns = extremes(arrival.headers)
-                    measured = newest_ns > NEVER
-                    watch.add(newest_ns[measured], arrival.host_ns[measured])
+            ingest.columns(batch)
         for sensor, found in zip(self._sensors, fit(watches, to), strict=True):
             sensor.clock.map = found
 

@@ -115,10 +115,9 @@ class Conversion:
         merge = ColumnMerge([pace.positions for pace in paces])
         self.batcher = Batcher(
             self.grid,
-            [sensor.intake() for sensor in self.sensors],
+            self.session.ingest.intakes,
             # Sweeps may begin or end in partial windows.
             Policy(job.max_wait_ns, job.keep_partial or job.is_fused, job.start, job.end),
-            self.session.clocks.guards,
             paces,
             merge,
         )
@@ -220,7 +219,7 @@ class Conversion:
                 self.passthrough.add(ingested.imu, batch.messages, self.batcher.limits_ns)
                 self._refuse_rejected()
                 # Steps 3 and 4: columns by timestamp; windows close behind the watermark.
-                yield from self.batcher.push(ingested.arrivals, batch.host_ns)
+                yield from self.batcher.push(ingested.accepted, batch.host_ns)
                 if progress is not None:
                     scans = 0 if self.table is None else self.table.rows
                     progress(self.session.position_bytes, self.session.size_bytes, scans)

@@ -8,13 +8,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from mlbatch.arrays import BoolArray, I64Array, U8Array
-from mlbatch.batching.intake import Arrival, rises
-from mlbatch.decode.packet_ring import headers_of
+from mlbatch.batching.intake import Accepted, Arrival, Intake, Payloads
 from mlbatch.discovery.crowd import Crowd
 from mlbatch.discovery.router import Role, Router
 from mlbatch.discovery.sampler import SAMPLES_PER_KIND, split_by_kind
 from mlbatch.discovery.types import PacketKind
-from mlbatch.lidar.interface import FAULTS
+from mlbatch.lidar.headers import Headers
+from mlbatch.lidar.interface import Lidar
 from mlbatch.pipeline.sensor import Sensor
 from mlbatch.readers.byte_records import rows
 from mlbatch.sensors import content_keys
@@ -29,9 +29,9 @@ StampMap = Callable[[Sensor, I64Array, I64Array], I64Array]
 
 @dataclass(slots=True)
 class Ingested:
-    """Content of a batch: an arrival for each sensor (None: no packet of it), IMU samples."""
+    """Content of a batch: what each sensor accepts (None: no packet of it), IMU samples."""
 
-    arrivals: list[Arrival | None]
+    accepted: list[Accepted | None]
     imu: list[ImuSamples]
 
 
@@ -76,15 +76,17 @@ IsIgnored = Callable[[PacketKind, U8Array], BoolArray]
 
 
 class Ingest:
-    """Assigns packets to sensors and reads their column headers; pixels stay raw.
+    """Assigns packets to sensors and takes their columns in; pixels stay raw.
 
-    unassigned: packets of no sensor; crowd: decides which kinds of them are listed.
+    intakes: one a sensor; unassigned: packets of no sensor; crowd: decides which kinds of them are
+    listed.
     """
 
     def __init__(
         self,
         router: Router,
         sensors: Sequence[Sensor],
+        intakes: Sequence[Intake],
         stamp_map: StampMap | None = None,
         is_ignored: IsIgnored | None = None,
     ) -> None:
@@ -94,11 +96,12 @@ class Ingest:
         self._is_ignored = is_ignored
         self._router = router
         self._sensors = list(sensors)
+        self.intakes = list(intakes)
         self._stamp_map = stamp_map
         self._recent_imu: list[I64Array] = [np.empty(0, np.int64) for _ in self._sensors]
 
     def columns(self, batch: PacketBatch) -> Ingested:
-        """Route a batch, keep lidar packets in their rings and read their column headers."""
+        """Route a batch, keep lidar packets in their rings and take their columns in."""
         own: list[list[I64Array]] = [[] for _ in self._sensors]
         ingested = Ingested([None] * len(self._sensors), [])
         owned = np.zeros(len(batch), bool)
@@ -122,8 +125,7 @@ class Ingest:
         for sensor, parts in zip(self._sensors, own, strict=True):
             if parts:
                 index = parts[0] if len(parts) == 1 else np.sort(np.concatenate(parts))
-                arrival = self._arrive(sensor, batch, index, owned)
-                ingested.arrivals[sensor.index] = arrival
+                ingested.accepted[sensor.index] = self._accept(sensor, batch, index, owned)
         if not owned.all():
             unassigned += [(kind, index[~owned[index]]) for kind, index in shared]
         left = [(kind, index) for kind, index in unassigned if len(index)]
@@ -164,40 +166,25 @@ class Ingest:
             self.unassigned[kind, ignored] = known
         known.add(batch, index)
 
-    def _arrive(
+    def _accept(
         self, sensor: Sensor, batch: PacketBatch, index: I64Array, owned: BoolArray
-    ) -> Arrival:
-        """Keep packets that may be of a sensor; give those that are, and are good."""
-        lidar = sensor.lidar
-        counts = sensor.ledger.packets
+    ) -> Accepted:
+        """Keep packets that may be of a sensor, and take in those that are."""
+        intake = self.intakes[sensor.index]
         kept = sensor.ring.keep(batch.data, batch.start[index], batch.place)
         host_ns = batch.host_ns[index]
         keys = None if batch.content_key is None else batch.content_key[index]
-        found = headers_of(lidar, sensor.ring, kept, host_ns, keys)
-        good = found.is_mine & ~owned[index]
-        counts.read += int(np.count_nonzero(good))
-        owned[index] |= good
-        if not found.is_usual:
-            for fault, count in enumerate(np.bincount(found.faults[good])[1:].tolist(), 1):
-                counts.reject(FAULTS[fault], count)
-            good &= found.faults == 0
-        arrival = Arrival(
-            position=index,
-            host_ns=host_ns,
-            key=found.key,
-            headers=found.columns,
-            ring_index=kept.ring_index,
-            column_offsets=sensor.ring.column_offsets(lidar.columns_per_packet),
-            is_rising=found.is_usual,
-        )
-        if not good.all():
-            arrival = arrival.take(good)
-        headers = arrival.headers
-        if self._stamp_map is not None:
-            headers.stamp_ns = self._stamp_map(sensor, headers.stamp_ns, arrival.host_ns)
-        if self._stamp_map is not None or not found.is_usual:
-            arrival.is_rising = rises(headers)
-        return arrival
+        packets = Payloads(kept.data, kept.start, keys)
+        content: Payloads | Headers = packets
+        if self._stamp_map is not None or not intake.reads:
+            content = _headers(sensor.lidar, packets, host_ns)
+            if self._stamp_map is not None:
+                columns = content.columns
+                columns.stamp_ns = self._stamp_map(sensor, columns.stamp_ns, host_ns)
+        arrival = Arrival(index, host_ns, kept.ring_index, content)
+        accepted = intake.accept(arrival, owned)
+        sensor.ledger.packets.read += accepted.read
+        return accepted
 
     def _imu(self, batch: PacketBatch, index: I64Array, sensor: Sensor) -> list[ImuSamples]:
         """Samples of IMU packets; duplicates are counted and left out."""
@@ -242,3 +229,17 @@ def _payload(batch: PacketBatch, number: int, kind: PacketKind) -> U8Array:
     """Payload of one packet of a kind."""
     begin = int(batch.start[number])
     return batch.data[begin : begin + kind.size]
+
+
+def _headers(lidar: Lidar, packets: Payloads, host_ns: I64Array) -> Headers:
+    """Headers of packets by the reader of a lidar, or by its own methods."""
+    data, start, keys = packets
+    if lidar.reader is not None:
+        return lidar.reader.read(data, start, host_ns, keys)
+    payloads = data[start[:, None] + np.arange(lidar.packet_size)]
+    return Headers(
+        lidar.sent_by_me(payloads),
+        lidar.faults(payloads),
+        lidar.sequence(payloads),
+        lidar.column_headers(payloads, host_ns),
+    )

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, NamedTuple
 
-from mlbatch.arrays import F64Array
+from mlbatch.arrays import F64Array, I64Array
 from mlbatch.batching.fill import Pace
 from mlbatch.batching.intake import Intake
 from mlbatch.clocks.timescale import timescale
@@ -105,16 +105,28 @@ class Sensor:
         most = max((table.most_packets.get(stream, 0) for stream in streams), default=0)
         return max(*spans, 0, most * packet_ns if most > 1 else 0)
 
+    @property
+    def column_offsets(self) -> I64Array:
+        """Ring indexes of the columns of a packet, relative to that of the packet: (C,)."""
+        return self.ring.column_offsets(self.lidar.columns_per_packet)
+
     def intake(self) -> Intake:
         """A new intake of the batcher for this sensor."""
         lidar = self.lidar
+        watches = self.clock.has_receive_times and not self.clock.by_host
         return Intake(
             self.name,
+            self.column_offsets,
+            lidar.reader,
             host_clock=self.clock.by_host,
             offset_ns=self.clock.offset_ns,
             modulus=lidar.sequence_modulus,
             packet_ns=lidar.columns_per_packet * lidar.column_period_ns,
             has_receive_times=self.clock.has_receive_times,
+            # Receive times show nothing of a sensor's clock.
+            finds_jumps=not self.clock.by_host,
+            # Delays cannot be measured where packets share the log time of a message.
+            watch=self.clock.watch if watches else None,
         )
 
     def pace(self) -> Pace:
@@ -143,4 +155,4 @@ class Sensor:
 
 def new_ring(lidar: Lidar, arena: PacketArena) -> PacketRing:
     """An empty ring for packets of a lidar."""
-    return PacketRing(lidar.packet_size, lidar.records, lidar.header_bytes, arena)
+    return PacketRing(lidar.packet_size, lidar.records, arena)

@@ -89,6 +89,7 @@ class Session:
         self.ingest = Ingest(
             self.setup.router,
             self.sensors,
+            [sensor.intake() for sensor in self.sensors],
             self.clocks.map_stamps if maps_stamps else None,
             self._is_ignored if job.selection.only or job.selection.ignore else None,
         )

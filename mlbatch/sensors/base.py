@@ -55,11 +55,6 @@ class BaseLidar:
     unproven: str = ""
 
     @property
-    def header_bytes(self) -> I64Array:
-        """The whole packet, where a lidar does not say what it reads."""
-        return np.array([[0, self.packet_size]])
-
-    @property
     def columns_per_s(self) -> float:
         """Columns sent in a second: one a period."""
         return NS_PER_S / self.column_period_ns if self.column_period_ns else 0.0

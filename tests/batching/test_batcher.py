@@ -14,39 +14,43 @@ import pytest
 
 from mlbatch.batching.batcher import Batcher
 from mlbatch.batching.grid import Grid
-from mlbatch.batching.intake import Arrival, Intake, JumpGuard
-from mlbatch.batching.windows import Limit, Policy
+from mlbatch.batching.intake import Accepted, Intake
+from mlbatch.batching.windows import Limit, Policy, Window
 from mlbatch.errors import ClockError, ClockJump
-from mlbatch.types import ColumnHeaders
-from tests.builders.hand import MS
+from tests.builders.arrivals import accepted_by, arrival_of
+from tests.builders.hand import MS, packet
+from tests.reference.intake import FeedPacket
 
 
-def _arrival(position: int, stamp_ms: float, host_ms: float, place: int) -> Arrival:
-    stamps = np.array([[round(stamp_ms * MS)]], np.int64)
-    return Arrival(
-        np.array([position]),
-        np.array([round(host_ms * MS)], np.int64),
-        np.array([-1], np.int64),
-        ColumnHeaders(stamps, np.zeros_like(stamps), np.ones((1, 1), bool)),
-        np.array([place]),
-    )
+class _Pushed:
+    """A batcher of sensors with packets of one column each."""
 
+    def __init__(self, *names: str, policy: Policy | None = None) -> None:
+        self.intakes = [Intake(name, np.zeros(1, np.int64), finds_jumps=True) for name in names]
+        self.batcher = Batcher(Grid(Fraction(10)), self.intakes, policy or Policy())
 
-def _batcher(*names: str, policy: Policy | None = None) -> Batcher:
-    grid = Grid(Fraction(10))
-    return Batcher(grid, [Intake(name) for name in names], policy or Policy())
+    def push(self, *packets: FeedPacket, places: Sequence[int] = ()) -> list[Window]:
+        """Windows that a batch closes; places: ring indices of the packets."""
+        accepted: list[Accepted | None] = []
+        place = np.array(places or [0] * len(packets), np.int64)
+        for number, intake in enumerate(self.intakes):
+            own = [at for at, one in enumerate(packets) if one.sensor == number]
+            arrival = arrival_of([packets[at] for at in own], 1, np.array(own, np.int64), 0)
+            arrival = arrival._replace(ring_index=place[own])
+            accepted.append(accepted_by(intake, arrival) if own else None)
+        host_ns = np.array([one.host_ns for one in packets], np.int64)
+        return list(self.batcher.push(accepted, host_ns))
 
 
 @pytest.mark.parametrize(("apart_ms", "comparable"), [(1000, True), (1000.000001, False)])
 def test_clocks_must_be_comparable(apart_ms: float, comparable: bool) -> None:
-    batcher = _batcher("left", "right")
-    arrivals = [_arrival(0, 5000, 9000, 0), _arrival(1, 5000 + apart_ms, 9000, 0)]
-    host_ns = np.array([9000 * MS, 9000 * MS])
+    pushed = _Pushed("left", "right")
+    packets = [packet(0, 5000, host_ms=9000), packet(1, 5000 + apart_ms, host_ms=9000)]
     if comparable:
-        assert list(batcher.push(arrivals, host_ns)) == []
+        assert pushed.push(*packets) == []
         return
     with pytest.raises(ClockError) as err:
-        list(batcher.push(arrivals, host_ns))
+        pushed.push(*packets)
     assert str(err.value) == (
         "clocks of the sensors cannot be compared: expected at most 1 s between them, found "
         "1.000 s: stamp minus receive time is -3.000 s for right and -4.000 s for left; use "
@@ -55,38 +59,38 @@ def test_clocks_must_be_comparable(apart_ms: float, comparable: bool) -> None:
 
 
 def test_the_oldest_place_that_is_needed() -> None:
-    batcher = _batcher("left")
-    assert batcher.oldest_ring_index(0) is None
+    pushed = _Pushed("left")
+    oldest = pushed.batcher.oldest_ring_index
+    assert oldest(0) is None
     for place, stamp_ms in ((7, 50), (8, 150), (9, 205)):
-        host_ns = np.array([round(stamp_ms * MS)])
-        list(batcher.push([_arrival(0, stamp_ms, stamp_ms, place)], host_ns))
+        pushed.push(packet(0, stamp_ms), places=[place])
     # At 205 the head [0, 100) has gone; 150 waits until 210.
-    assert batcher.oldest_ring_index(0) == 8
-    list(batcher.push([_arrival(0, 260, 260, 10)], np.array([260 * MS])))
-    assert batcher.oldest_ring_index(0) == 9
+    assert oldest(0) == 8
+    pushed.push(packet(0, 260), places=[10])
+    assert oldest(0) == 9
     # 9000 is held until the next packet confirms it or not.
-    list(batcher.push([_arrival(0, 9000, 261, 11)], np.array([261 * MS])))
-    list(batcher.push([_arrival(0, 320, 320, 12)], np.array([320 * MS])))
-    assert batcher.oldest_ring_index(0) == 12
+    pushed.push(packet(0, 9000, host_ms=261), places=[11])
+    pushed.push(packet(0, 320), places=[12])
+    assert oldest(0) == 12
 
 
 @pytest.mark.parametrize(("limit", "past_at_ms"), [(Limit(300 * MS), 310), (Limit(MS, True), 210)])
 def test_an_end_is_passed_when_its_last_window_is_closed(limit: Limit, past_at_ms: int) -> None:
     """Limits count from time 0, or from t_init, which is 100."""
-    batcher = _batcher("left", policy=Policy(end=limit))
+    pushed = _Pushed("left", policy=Policy(end=limit))
     past = {}
     for stamp_ms in (50, 150, 209, 210, 309, 310):
-        list(batcher.push([_arrival(0, stamp_ms, stamp_ms, 0)], np.array([stamp_ms * MS])))
-        past[stamp_ms] = batcher.past_end
+        pushed.push(packet(0, stamp_ms))
+        past[stamp_ms] = pushed.batcher.past_end
     assert past == {stamp_ms: stamp_ms >= past_at_ms for stamp_ms in past}
 
 
 def test_spans_and_first_stamps_are_kept_for_the_report() -> None:
-    batcher = _batcher("left", "right")
-    list(batcher.push([_arrival(0, 50, 60, 0), None], np.array([60 * MS])))
-    list(batcher.push([_arrival(0, 150, 155, 0), None], np.array([155 * MS])))
-    assert batcher.firsts == [(50 * MS, 60 * MS), None]
-    assert batcher.spans_ns == [(50 * MS, 150 * MS), None]
+    pushed = _Pushed("left", "right")
+    pushed.push(packet(0, 50, host_ms=60))
+    pushed.push(packet(0, 150, host_ms=155))
+    assert pushed.batcher.firsts == [(50 * MS, 60 * MS), None]
+    assert pushed.batcher.spans_ns == [(50 * MS, 150 * MS), None]
 
 
 # -- clocks that jump: where the session is cut, for any batches ---------------------------------
@@ -96,31 +100,18 @@ Feed = Sequence[tuple[int, int, int]]
 EPOCH = 100_000
 
 
-def _rows(rows: Sequence[tuple[int, int, int, int]]) -> Arrival | None:
-    if not rows:
-        return None
-    place, _, host, stamp = np.array(rows, np.int64).T
-    stamps = (stamp * MS)[:, None]
-    headers = ColumnHeaders(stamps, np.zeros_like(stamps), np.ones(stamps.shape, bool))
-    return Arrival(place, host * MS, np.full(len(place), -1), headers, place)
-
-
 def _cut_ms(feed: Feed, *ends: int) -> int:
     """Where a feed is to be cut, pushed in batches that end at these packets."""
-    names = ("left", "right")
-    guards = [JumpGuard(name) for name in names]
-    batcher = Batcher(Grid(Fraction(10)), [Intake(name) for name in names], Policy(), guards)
     with pytest.raises(ClockJump) as err:
-        _push(batcher, feed, (0, *ends, len(feed)))
+        _push_all(feed, (0, *ends, len(feed)))
     return err.value.host_ns // MS
 
 
-def _push(batcher: Batcher, feed: Feed, ends: Sequence[int]) -> None:
+def _push_all(feed: Feed, ends: Sequence[int]) -> None:
+    pushed = _Pushed("left", "right")
     for begin, end in itertools.pairwise(ends):
-        batch = [(place, *packet) for place, packet in enumerate(feed[begin:end])]
-        own = [_rows([row for row in batch if row[1] == sensor]) for sensor in (0, 1)]
-        host_ns = np.array([packet[1] * MS for packet in feed[begin:end]], np.int64)
-        list(batcher.push(own, host_ns))
+        batch = [packet(one, stamp, host_ms=host) for one, host, stamp in feed[begin:end]]
+        pushed.push(*batch)
 
 
 @pytest.mark.parametrize("step", [37_000, -20_000])

@@ -1,101 +1,125 @@
-"""The intake of one sensor, worked by hand; times in ms, steps above 1 s need confirmation."""
+"""The intake of one sensor, worked by hand and compared with the literal one; times in ms.
+
+Steps above 1 s need confirmation.
+"""
 
 from __future__ import annotations
 
+import random
 from collections.abc import Sequence
+from dataclasses import dataclass, field
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
-from mlbatch.batching.intake import DUPLICATE_REACH, NEVER, Accepted, Arrival, Intake
-from mlbatch.errors import ClockError
-from mlbatch.types import ColumnHeaders
+from mlbatch.arrays import I64Array
+from mlbatch.batching.intake import DUPLICATE_REACH, FOREVER, NEVER, Accepted, Arrival, Intake
+from mlbatch.errors import ClockError, ClockJump
+from mlbatch.lidar.headers import Headers
+from tests.builders.arrivals import WIDEST, accepted_by, arrival_of
+from tests.reference.intake import FeedPacket, Numbers, StepError
+from tests.reference.intake import Intake as LiteralIntake
 
 MS = 10**6
 S = 10**9
 Stamps = Sequence[float]
 
 
-def _arrival(*packets: Stamps, keys: Sequence[int] = (), valid: Sequence[Stamps] = ()) -> Arrival:
+def _feed(*packets: Stamps, keys: Sequence[int] = (), valid: Sequence[Stamps] = ()) -> Arrival:
     """Packets of equal width, stamps in ms; received 1 ms after their largest stamp."""
-    stamps = np.array([[round(stamp * MS) for stamp in packet] for packet in packets], np.int64)
-    count = len(packets)
-    return Arrival(
-        position=np.arange(count),
-        host_ns=stamps.max(axis=1) + MS,
-        key=np.array(keys or range(count), np.int64),
-        headers=ColumnHeaders(
-            stamps,
-            np.zeros_like(stamps),
-            np.array(valid, bool) if len(valid) else np.ones(stamps.shape, bool),
-        ),
-        ring_index=np.arange(count) * stamps.shape[1],
-    )
+    feed = []
+    for number, stamps_ms in enumerate(packets):
+        stamps = tuple(round(stamp * MS) for stamp in stamps_ms)
+        good = tuple(map(bool, valid[number])) if valid else (True,) * len(stamps)
+        feed.append(FeedPacket(0, max(stamps) + MS, (keys or range(99))[number], stamps, good))
+    return arrival_of(feed, len(packets[0]), np.arange(len(packets)), 0)
+
+
+def _left(columns: int = 1, **options: int) -> Intake:
+    return Intake("left", np.arange(columns), **options)  # type: ignore[arg-type]
 
 
 def _stamps_ms(accepted: Accepted) -> list[list[float]]:
-    rows: list[list[float]] = (accepted.packets.headers.stamp_ns / MS).tolist()
+    rows: list[list[float]] = (accepted.columns.stamp_ns / MS).tolist()
     return rows
 
 
 def _alone(*stamps_ms: float, first_key: int = 0) -> Arrival:
     keys = range(first_key, first_key + len(stamps_ms))
-    return _arrival(*([stamp] for stamp in stamps_ms), keys=keys)
+    return _feed(*([stamp] for stamp in stamps_ms), keys=keys)
 
 
 def test_good_packets_pass_untouched() -> None:
-    intake = Intake("left")
-    accepted = intake.accept(_arrival([10, 20], [30, 40]))
+    intake = _left(2)
+    accepted = accepted_by(intake, _feed([10, 20], [30, 40]))
     assert _stamps_ms(accepted) == [[10, 20], [30, 40]]
     assert accepted.newest_ns.tolist() == [20 * MS, 40 * MS]
+    assert accepted.lowest_ns.tolist() == [10 * MS, 30 * MS]
+    assert accepted.ring_index.tolist() == [[0, 1], [WIDEST, WIDEST + 1]]
+    assert (accepted.read, accepted.oldest, accepted.invalid) == (2, 0, 0)
     assert intake.rejected == {}
+
+
+def test_packets_of_other_sensors_and_damaged_ones_are_left_out() -> None:
+    """Of five the second is another sensor's by its number, the fourth has been taken."""
+    arrival = _alone(10, 20, 30, 40, 50)
+    assert isinstance(arrival.content, Headers)
+    arrival.content.is_mine[1] = False
+    arrival.content.faults[2] = 2
+    owned = np.array([False, False, False, True, False])
+    intake = _left()
+    accepted = intake.accept(arrival, owned)
+    assert _stamps_ms(accepted) == [[10], [50]]
+    assert owned.tolist() == [True, False, True, True, True]
+    assert (accepted.read, intake.rejected) == (3, {"bad_header": 1})
 
 
 # -- duplicates -----------------------------------------------------------------------------------
 
 
 def test_the_second_of_two_equal_packets_is_a_duplicate() -> None:
-    intake = Intake("left")
-    arrival = _arrival([10], [20], [10], [30], [30], keys=[5, 6, 5, 7, 7])
-    assert _stamps_ms(intake.accept(arrival)) == [[10], [20], [30]]
+    intake = _left()
+    arrival = _feed([10], [20], [10], [30], [30], keys=[5, 6, 5, 7, 7])
+    assert _stamps_ms(accepted_by(intake, arrival)) == [[10], [20], [30]]
     assert intake.rejected == {"duplicate": 2}
     assert intake.renumbered == 0
 
 
 def test_other_packets_of_the_same_number_are_counted_apart() -> None:
-    intake = Intake("left")
-    intake.accept(_arrival([10], [20], [10], [25], keys=[5, 6, 5, 6]))
+    intake = _left()
+    accepted_by(intake, _feed([10], [20], [10], [25], keys=[5, 6, 5, 6]))
     assert (intake.rejected, intake.renumbered) == ({"duplicate": 2}, 1)
     # Across batches, and once each.
-    intake.accept(_arrival([25], [30], keys=[6, 7]))
-    intake.accept(_arrival([31], keys=[7]))
+    accepted_by(intake, _feed([25], [30], keys=[6, 7]))
+    accepted_by(intake, _feed([31], keys=[7]))
     assert (intake.rejected, intake.renumbered) == ({"duplicate": 4}, 2)
 
 
 def test_a_duplicate_is_known_across_batches() -> None:
-    intake = Intake("left")
-    intake.accept(_alone(10, 20, 30))
-    assert _stamps_ms(intake.accept(_alone(30, 40, first_key=2))) == [[40]]
+    intake = _left()
+    accepted_by(intake, _alone(10, 20, 30))
+    assert _stamps_ms(accepted_by(intake, _alone(30, 40, first_key=2))) == [[40]]
     assert intake.rejected == {"duplicate": 1}
 
 
 def test_equal_stamps_make_no_duplicate() -> None:
-    intake = Intake("left")
-    assert len(intake.accept(_arrival([10], [10], keys=[1, 2])).packets.key) == 2
+    assert len(accepted_by(_left(), _feed([10], [10], keys=[1, 2])).position) == 2
 
 
 def test_packets_without_identity_are_never_duplicates() -> None:
-    intake = Intake("left")
-    assert len(intake.accept(_arrival([10], [20], [30], keys=[-1, -1, -1])).packets.key) == 3
+    accepted = accepted_by(_left(), _feed([10], [20], [30], keys=[-1, -1, -1]))
+    assert len(accepted.position) == 3
 
 
 @pytest.mark.parametrize(("between", "rejected"), [(DUPLICATE_REACH - 1, 1), (DUPLICATE_REACH, 0)])
 def test_numbers_repeat_after_a_while(between: int, rejected: int) -> None:
     """Frame ids wrap: what is far back is another packet."""
-    intake = Intake("left")
-    intake.accept(_alone(0.0))
-    intake.accept(_alone(*np.arange(1, between + 1) / 10, first_key=1))
-    intake.accept(_alone(between / 10 + 1))
+    intake = _left()
+    accepted_by(intake, _alone(0.0))
+    accepted_by(intake, _alone(*np.arange(1, between + 1) / 10, first_key=1))
+    accepted_by(intake, _alone(between / 10 + 1))
     assert intake.rejected.get("duplicate", 0) == rejected
 
 
@@ -115,15 +139,16 @@ def test_numbers_repeat_after_a_while(between: int, rejected: int) -> None:
     ],
 )
 def test_impossible_stamps(stamps: Stamps, good: bool) -> None:
-    intake = Intake("left")
-    accepted = intake.accept(_arrival(stamps))
-    assert len(accepted.packets.key) == good
+    intake = _left(len(stamps))
+    accepted = accepted_by(intake, _feed(stamps))
+    assert len(accepted.position) == good
     assert intake.rejected == ({} if good else {"bad_stamp": 1})
 
 
 def test_a_wild_stamp_that_the_next_packet_does_not_confirm_is_rejected() -> None:
-    intake = Intake("left")
-    assert _stamps_ms(intake.accept(_alone(10, 20, 7020, 30, 40))) == [[10], [20], [30], [40]]
+    intake = _left()
+    accepted = accepted_by(intake, _alone(10, 20, 7020, 30, 40))
+    assert _stamps_ms(accepted) == [[10], [20], [30], [40]]
     assert intake.rejected == {"bad_stamp": 1}
     intake.finish()
     assert intake.rejected == {"bad_stamp": 1}
@@ -131,99 +156,273 @@ def test_a_wild_stamp_that_the_next_packet_does_not_confirm_is_rejected() -> Non
 
 @pytest.mark.parametrize(("step_ms", "held"), [(1000, False), (1000.000001, True)])
 def test_a_step_of_one_second_needs_no_confirmation(step_ms: float, held: bool) -> None:
-    intake = Intake("left")
-    accepted = intake.accept(_alone(10, 10 + step_ms))
-    assert len(accepted.packets.key) == (1 if held else 2)
+    intake = _left()
+    accepted = accepted_by(intake, _alone(10, 10 + step_ms))
+    assert len(accepted.position) == (1 if held else 2)
     assert (intake.held_ring_index is not None) == held
 
 
 def test_a_gap_is_confirmed_by_the_next_packet() -> None:
     """Both are delivered with the packet that confirms."""
-    intake = Intake("left")
-    accepted = intake.accept(_alone(10, 20, 5000, 5010, 5020))
+    intake = _left()
+    accepted = accepted_by(intake, _alone(10, 20, 5000, 5010, 5020))
     assert _stamps_ms(accepted) == [[10], [20], [5000], [5010], [5020]]
-    assert accepted.packets.position.tolist() == [0, 1, 3, 3, 4]
+    assert accepted.position.tolist() == [0, 1, 3, 3, 4]
+    assert accepted.ahead_ns == 4980 * MS
     assert intake.rejected == {}
 
 
 def test_a_packet_is_held_until_the_next_batch() -> None:
-    intake = Intake("left")
-    first = intake.accept(_alone(10, 5000))
+    intake = _left()
+    first = accepted_by(intake, _alone(10, 5000))
     assert _stamps_ms(first) == [[10]]
     # The second packet's pixels must stay where they are.
-    assert intake.held_ring_index == 1
-    second = intake.accept(_alone(5010, first_key=2))
+    assert (intake.held_ring_index, intake.held_host_ns) == (WIDEST, 5001 * MS)
+    second = accepted_by(intake, _alone(5010, first_key=2))
     assert _stamps_ms(second) == [[5000], [5010]]
-    assert second.packets.position.tolist() == [0, 0]
+    assert second.position.tolist() == [0, 0]
     assert intake.held_ring_index is None
 
 
 def test_a_packet_that_is_held_at_the_end_was_never_confirmed() -> None:
-    intake = Intake("left")
-    intake.accept(_alone(10, 20, 90_000))
+    intake = _left()
+    accepted_by(intake, _alone(10, 20, 90_000))
     intake.finish()
     assert intake.rejected == {"bad_stamp": 1}
     assert intake.held_ring_index is None
 
 
 def test_two_wild_packets_do_not_confirm_each_other() -> None:
-    intake = Intake("left")
-    assert _stamps_ms(intake.accept(_alone(10, 5000, 9000, 20))) == [[10], [20]]
+    intake = _left()
+    assert _stamps_ms(accepted_by(intake, _alone(10, 5000, 9000, 20))) == [[10], [20]]
     assert intake.rejected == {"bad_stamp": 2}
 
 
 def test_a_reset_clock_is_an_error_that_names_both_times() -> None:
-    intake = Intake("left")
-    with pytest.raises(ClockError) as err:
-        intake.accept(_alone(100_000, 100_010, 3, 13))
-    assert str(err.value) == (
+    jump = accepted_by(_left(), _alone(100_000, 100_010, 3, 13)).jump
+    assert isinstance(jump, ClockError)
+    assert jump.host_ns == 4 * MS
+    assert str(jump) == (
         "sensor left: clock reset within the recording: expected stamps of one continuous clock, "
         "found a step back from 100.010000 s to 0.003000 s; use --on-jump split, or --clock host"
     )
 
 
+def test_a_clock_that_is_set_forward_is_an_error_that_names_both_times() -> None:
+    """9 s within 10 ms at the host; after a silence of the host as well it is a gap."""
+    arrival = _alone(1000, 10_000, 10_010)
+    host_ns = np.array([1001, 1011, 1021]) * MS
+    jump = accepted_by(_left(finds_jumps=True), arrival._replace(host_ns=host_ns)).jump
+    assert isinstance(jump, ClockJump)
+    assert jump.host_ns == 1011 * MS
+    assert str(jump) == (
+        "sensor left: clock jump within the recording: expected stamps of one continuous clock, "
+        "found a step forward from 1.000000 s to 10.000000 s within 0.010000 s at the capture "
+        "host; use --on-jump split, or --clock host"
+    )
+    for silent_ns in (arrival.host_ns, host_ns * 0):
+        silent = arrival._replace(host_ns=silent_ns)
+        assert len(accepted_by(_left(finds_jumps=True), silent).position) == 3
+
+
 def test_a_single_step_back_is_rejected() -> None:
-    intake = Intake("left")
-    assert _stamps_ms(intake.accept(_alone(100_000, 3, 100_010))) == [[100_000], [100_010]]
+    intake = _left()
+    assert _stamps_ms(accepted_by(intake, _alone(100_000, 3, 100_010))) == [[100_000], [100_010]]
     assert intake.rejected == {"bad_stamp": 1}
 
 
 def test_invalid_columns_are_no_stamps() -> None:
     """The stamp of a masked column neither delays a packet nor counts as newest."""
-    intake = Intake("left")
-    arrival = _arrival([10, 10], [20, 9e6], [-5, 30], valid=[[1, 1], [1, 0], [0, 1]])
-    accepted = intake.accept(arrival)
+    intake = _left(2)
+    arrival = _feed([10, 10], [20, 9e6], [-5, 30], valid=[[1, 1], [1, 0], [0, 1]])
+    accepted = accepted_by(intake, arrival)
     assert accepted.newest_ns.tolist() == [10 * MS, 20 * MS, 30 * MS]
-    assert intake.rejected == {}
+    assert (intake.rejected, accepted.invalid) == ({}, 2)
 
 
 def test_a_packet_without_a_valid_column_is_accepted() -> None:
-    intake = Intake("left")
-    accepted = intake.accept(_arrival([10], [9e6], [20], valid=[[1], [0], [1]]))
+    accepted = accepted_by(_left(), _feed([10], [9e6], [20], valid=[[1], [0], [1]]))
     assert accepted.newest_ns.tolist() == [10 * MS, NEVER, 20 * MS]
+    assert accepted.lowest_ns.tolist() == [10 * MS, FOREVER, 20 * MS]
+
+
+def test_a_pass_that_measures_clocks_takes_all() -> None:
+    intake = _left(takes_all=True)
+    assert len(accepted_by(intake, _feed([10], [10], [9e6], [-5], keys=[1, 1, 2, 3])).host_ns) == 4
 
 
 # -- clocks ---------------------------------------------------------------------------------------
 
 
 def test_an_offset_is_added_to_the_stamps() -> None:
-    intake = Intake("left", offset_ns=-37 * S)
-    assert _stamps_ms(intake.accept(_alone(37_010, 37_020))) == [[10], [20]]
+    intake = _left(offset_ns=-37 * S)
+    assert _stamps_ms(accepted_by(intake, _alone(37_010, 37_020))) == [[10], [20]]
 
 
 def test_the_host_clock_keeps_the_age_of_columns_within_their_packet() -> None:
     """The newest column gets the receive time of its packet."""
-    intake = Intake("left", host_clock=True)
-    arrival = _arrival([10, 12], [20, 22])
-    arrival.host_ns = np.array([1_000_000 * MS, 1_000_011 * MS])
-    accepted = intake.accept(arrival)
+    intake = _left(2, host_clock=True)
+    arrival = _feed([10, 12], [20, 22])
+    arrival = arrival._replace(host_ns=np.array([1_000_000 * MS, 1_000_011 * MS]))
+    accepted = accepted_by(intake, arrival)
     assert _stamps_ms(accepted) == [[999_998, 1_000_000], [1_000_009, 1_000_011]]
     assert accepted.newest_ns.tolist() == [1_000_000 * MS, 1_000_011 * MS]
 
 
 def test_loss_is_counted_of_accepted_packets_only() -> None:
-    intake = Intake("left", modulus=64)
+    intake = _left(modulus=64)
     # 2 and 3 are missing; 1 comes twice; the wild one is number 6.
-    intake.accept(_arrival([10], [20], [20], [30], [50_000], [40], keys=[0, 1, 1, 4, 6, 5]))
+    arrival = _feed([10], [20], [20], [30], [50_000], [40], keys=[0, 1, 1, 4, 6, 5])
+    accepted_by(intake, arrival)
     assert (intake.loss.lost, intake.loss.reordered) == (2, 0)
     assert intake.rejected == {"duplicate": 1, "bad_stamp": 1}
+
+
+# -- the literal intake ---------------------------------------------------------------------------
+
+# Numbers wrap there in feeds.
+MODULUS = 5000
+
+
+@dataclass
+class _Seen:
+    """What an intake gives of a feed; step: stamps around the step of a clock, receive time."""
+
+    # Position in the feed of the packet with which each is delivered, stamps of the valid columns.
+    packets: list[tuple[int, int, list[int]]] = field(default_factory=list)
+    newest: list[int] = field(default_factory=list)
+    rejected: dict[str, int] = field(default_factory=dict)
+    renumbered: int = 0
+    held: list[int | None] = field(default_factory=list)  # receive time after each batch
+    loss: tuple[int, int] = (0, 0)
+    step: tuple[str, int] | None = None
+    watched: list[tuple[int, int]] = field(default_factory=list)
+
+    def add(self, stamp_ns: I64Array, host_ns: I64Array) -> None:
+        """As `Watch`."""
+        self.watched += zip(stamp_ns.tolist(), host_ns.tolist(), strict=True)
+
+
+def _literal(feed: Sequence[FeedPacket], sizes: Sequence[int], *, by_host: bool) -> _Seen:
+    seen = _Seen()
+    intake = LiteralIntake(by_host, finds_jumps=not by_host)
+    numbers = Numbers(MODULUS)
+    ends = set(np.cumsum(sizes).tolist())
+    for at, packet in enumerate(feed):
+        try:
+            accepted = intake.take(packet)
+        except StepError as step:
+            seconds = f"from {step.before_ns / S:.6f} s to {step.after_ns / S:.6f} s"
+            seen.step = seconds, step.host_ns
+            return seen
+        for one in accepted:
+            stamps = one.valid_stamps()
+            seen.packets.append((at, one.host_ns, stamps))
+            seen.newest.append(max(stamps, default=NEVER))
+            numbers.add(one.key)
+            if stamps:
+                seen.watched.append((max(stamps), one.host_ns))
+        if at + 1 in ends:
+            seen.held.append(None if intake.held is None else intake.held.host_ns)
+    intake.finish()
+    seen.rejected = intake.rejected
+    seen.renumbered = intake.renumbered
+    seen.loss = numbers.lost, numbers.reordered
+    return seen
+
+
+def _compiled(feed: Sequence[FeedPacket], sizes: Sequence[int], *, by_host: bool) -> _Seen:
+    seen = _Seen()
+    width = len(feed[0].stamps)
+    intake = Intake(
+        "left",
+        np.arange(width),
+        host_clock=by_host,
+        modulus=MODULUS,
+        finds_jumps=not by_host,
+        watch=seen,
+    )
+    begin = 0
+    for size in sizes:
+        position = begin + np.arange(size)
+        accepted = accepted_by(intake, arrival_of(feed[begin : begin + size], width, position, 0))
+        begin += size
+        if accepted.jump is not None:
+            text = str(accepted.jump)
+            seconds = text[text.index("from") :].replace(";", " within").split(" within")[0]
+            seen.step = seconds, accepted.jump.host_ns
+        columns = accepted.columns
+        for row, at in enumerate(accepted.position.tolist()):
+            stamps = columns.stamp_ns[row][columns.valid[row]].tolist()
+            seen.packets.append((at, int(accepted.host_ns[row]), stamps))
+        seen.newest += accepted.newest_ns.tolist()
+        assert accepted.invalid == np.count_nonzero(~columns.valid)
+        _check_order(seen.packets[len(seen.packets) - len(accepted.position) :], seen, accepted)
+        if seen.step:
+            return seen
+        seen.held.append(intake.held_host_ns)
+    intake.finish()
+    seen.rejected = intake.rejected
+    seen.renumbered = intake.renumbered
+    seen.loss = intake.loss.lost, intake.loss.reordered
+    return seen
+
+
+def _check_order(
+    new: Sequence[tuple[int, int, list[int]]], seen: _Seen, accepted: Accepted
+) -> None:
+    """How far columns are behind and ahead of the newest before them, as the batcher has it."""
+    before = [
+        stamp for *_, stamps in seen.packets[: len(seen.packets) - len(new)] for stamp in stamps
+    ]
+    newest = max(before, default=NEVER)
+    behind = ahead = 0
+    for *_, stamps in new:
+        for stamp in stamps:
+            behind = max(behind, newest - stamp)
+            ahead = max(ahead, stamp - newest) if newest > NEVER else 0
+            newest = max(newest, stamp)
+    assert (accepted.behind_ns, accepted.ahead_ns) == (behind, ahead)
+
+
+def _drawn(rng: random.Random) -> tuple[list[FeedPacket], list[int], bool]:
+    """Packets of a sensor as nothing sends them, sizes of batches; whether by the host clock."""
+    width = rng.choice([1, 2, 3])
+    wild = rng.choice([0.0, 0.05, 0.3])
+    stamp_ns, host_ns, key = rng.choice([0, 5 * S, 2**31 * S - 3 * S]), 10 * S, rng.randrange(9)
+    feed: list[FeedPacket] = []
+    for _ in range(rng.randint(1, 60)):
+        stamp_ns += rng.choice([MS, 20 * MS, -3 * MS])
+        host_ns += rng.choice([MS, 20 * MS, 0])
+        key += 1
+        if rng.random() < wild:
+            leap_ns = rng.choice([-7 * S, -S, -S - 1, S, S + 1, 3 * S, 60 * S])
+            stamp_ns += leap_ns
+            host_ns += rng.choice([0, 0, abs(leap_ns)])
+            key += rng.choice([0, 2, 900, 1100, 3000])
+        stamps = [stamp_ns + column * MS // 2 for column in range(width)]
+        if rng.random() < wild:
+            stamps[rng.randrange(width)] += rng.choice([-2 * S, -S, S, 9 * S, 2**62])
+        valid = tuple(rng.random() >= wild for _ in stamps)
+        number = rng.choice([-1, key % 5, key]) if rng.random() < wild else key
+        packet = FeedPacket(
+            0, host_ns, number % MODULUS if number >= 0 else -1, tuple(stamps), valid
+        )
+        feed.append(rng.choice(feed) if feed and rng.random() < wild / 2 else packet)
+    sizes: list[int] = []
+    most = rng.choice([1, 2, 7, len(feed)])
+    while sum(sizes) < len(feed):
+        sizes.append(min(rng.randint(1, most), len(feed) - sum(sizes)))
+    return feed, sizes, rng.random() < 0.3
+
+
+@settings(max_examples=400)
+@given(st.integers(0, 2**32))
+def test_the_rules_are_those_of_the_literal_intake(seed: int) -> None:
+    feed, sizes, by_host = _drawn(random.Random(seed))
+    seen = _compiled(feed, sizes, by_host=by_host)
+    expected = _literal(feed, sizes, by_host=by_host)
+    if expected.step:
+        # The batch of a step is not watched.
+        expected.watched = expected.watched[: len(seen.watched)]
+    assert seen == expected

@@ -64,7 +64,7 @@ class Driver:
         self.run.session.keep_from(oldest)
         ingested = self.run.session.ingest.columns(batch)
         scans = 0
-        for window in batcher.push(ingested.arrivals, batch.host_ns):
+        for window in batcher.push(ingested.accepted, batch.host_ns):
             self._pool = self._pool or self.run.pool
             for task in self._pool.tasks(window):
                 self._pool.workers[0].decode(task)

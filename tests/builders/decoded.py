@@ -58,7 +58,7 @@ def readings(
     headers = lidar.column_headers(packets, received_ns)
     ring = new_ring(lidar, PacketArena())
     start = np.arange(len(packets), dtype=np.int64) * lidar.packet_size
-    _, first = ring.store(packets.reshape(-1).copy(), start)
+    first = ring.keep(packets.reshape(-1).copy(), start).ring_index
     place = first[:, None] + ring.column_offsets(lidar.columns_per_packet)
     pose = np.eye(4) if body_from_sensor is None else body_from_sensor
     source = Source(lidar, ring, pose, 0, keep_repeated=True)

@@ -15,9 +15,9 @@ from typing import TypeAlias
 
 from hypothesis import strategies as st
 
-from mlbatch.errors import ClockError
 from tests.builders.faults import spoiled
-from tests.reference.batching import FeedPacket, Intake, Settings
+from tests.reference.batching import FeedPacket, Settings
+from tests.reference.intake import Intake, StepError
 
 NS_PER_S = 10**9
 NS_PER_MS = 10**6
@@ -216,12 +216,12 @@ def interleavings(case: Case, rng: random.Random, count: int) -> list[list[FeedP
     """
     feed, settings = case
     queues: list[list[_Step]] = [[] for _ in range(settings.sensors)]
-    intakes = [Intake(sensor, settings.host_clock) for sensor in range(settings.sensors)]
+    intakes = [Intake(settings.host_clock) for _ in range(settings.sensors)]
     lag = _Lag(settings.max_wait_ns, [None] * settings.sensors, [None] * settings.sensors)
     for packet in feed:
         try:
             accepted = intakes[packet.sensor].take(packet)
-        except ClockError:
+        except StepError:
             return []
         step = (packet, [one.valid_stamps() for one in accepted])
         queues[packet.sensor].append(step)

@@ -61,7 +61,7 @@ class StoredSensor:
         data = np.frombuffer(b"".join(payloads), np.uint8)
         ring = new_ring(lidar, PacketArena())
         start = np.arange(len(payloads), dtype=np.int64) * lidar.packet_size
-        _, first = ring.store(data.copy(), start)
+        first = ring.keep(data.copy(), start).ring_index
         self.ring_index = (first[:, None] + ring.column_offsets(16)).ravel()
         self.source = Source(
             lidar,

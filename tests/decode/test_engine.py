@@ -174,7 +174,7 @@ def filled(lidar: Lidar, rng: np.random.Generator) -> tuple[PacketRing, I64Array
         count = int(rng.integers(20, 45))
         start = np.arange(count) * lidar.packet_size
         arena.keep_from(int(places[0]) if len(places) else None)
-        _, places = ring.store(packets_of(lidar, rng, count), start)
+        places = ring.keep(packets_of(lidar, rng, count), start).ring_index
     return ring, (places[:, None] + ring.column_offsets(lidar.columns_per_packet)).reshape(-1)
 
 
@@ -431,7 +431,7 @@ def test_records_stay_while_the_loops_run() -> None:
 
         def mlbatch_decode(self, scan: object) -> int:
             start = np.arange(1000) * lidar.packet_size
-            ring.store(packets_of(lidar, rng, 1000), start)
+            ring.keep(packets_of(lidar, rng, 1000), start)
             grown.append(before() is not None and before() is not ring.view[0])
             return int(decode_columns(scan))
 

@@ -36,7 +36,7 @@ def _sensor(number: int, seen: Seen) -> Sensor:
     sent = seen.sent
     ring = new_ring(lidar, PacketArena())
     start = np.arange(len(sent.payloads), dtype=np.int64) * lidar.packet_size
-    _, first = ring.store(sent.payloads.reshape(-1).copy(), start)
+    first = ring.keep(sent.payloads.reshape(-1).copy(), start).ring_index
     place = (first[:, None] + ring.column_offsets(lidar.columns_per_packet)).reshape(-1)
     headers = lidar.column_headers(sent.payloads, sent.host_ns)
     source = Source(lidar, ring, _POSES[number], number * lidar.channels, 1.0 + number, 90.0)

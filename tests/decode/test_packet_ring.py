@@ -20,7 +20,6 @@ SIZE = 40
 # Four columns of 9 bytes from byte 4, two in a row.
 RECORDS = Records(start=4, stride=18, size=9, per_row=2, step=9)
 COLUMNS = 4
-HEADERS = np.array([[0, 4], [38, 2]])
 
 
 def _packets(seed: int, count: int) -> U8Array:
@@ -58,7 +57,7 @@ def test_records_stay_until_they_are_not_needed(
 ) -> None:
     """behind: batches whose records are still needed when the next is read."""
     arena = PacketArena()
-    ring = PacketRing(SIZE, RECORDS, HEADERS, arena)
+    ring = PacketRing(SIZE, RECORDS, arena)
     kept: list[tuple[I64Array, U8Array]] = []
     for number, count in enumerate(sizes):
         packets = _packets(number, count)
@@ -66,14 +65,14 @@ def test_records_stay_until_they_are_not_needed(
         arena.keep_from(oldest)
         if is_read[number]:
             region, start, place = _read(arena, packets, number % 3)
-            headers, first = ring.store(region, start, place)
+            kept_now = ring.keep(region, start, place)
         else:
             # The reader's own memory.
             start = np.arange(count) * SIZE
-            headers, first = ring.store(packets.reshape(-1).copy(), start)
-        assert np.array_equal(headers[:, :4], packets[:, :4])
-        assert np.array_equal(headers[:, 38:], packets[:, 38:])
-        kept.append((first, _columns(packets)))
+            kept_now = ring.keep(packets.reshape(-1).copy(), start)
+        read = kept_now.data[kept_now.start[:, None] + np.arange(SIZE)]
+        assert np.array_equal(read, packets)
+        kept.append((kept_now.ring_index, _columns(packets)))
         for one, expected in kept:
             assert np.array_equal(_gathered(ring, one), expected)
         kept = kept[len(kept) - behind :] if behind else []
@@ -81,11 +80,11 @@ def test_records_stay_until_they_are_not_needed(
 
 def test_memory_is_used_again() -> None:
     arena = PacketArena()
-    ring = PacketRing(SIZE, RECORDS, HEADERS, arena)
+    ring = PacketRing(SIZE, RECORDS, arena)
     sizes = []
     for number in range(100):
         region, start, place = _read(arena, _packets(number, 20), 2)
-        _, first = ring.store(region, start, place)
+        first = ring.keep(region, start, place).ring_index
         arena.keep_from(int(first[-1]))
         sizes.append(ring.nbytes)
     assert len(set(sizes[3:])) == 1
@@ -95,13 +94,13 @@ def test_memory_is_used_again() -> None:
 def test_packets_of_one_batch_do_not_replace_each_other() -> None:
     """Nothing waits when the first sensor's packets are copied; the second's come to others."""
     arena = PacketArena()
-    rings = [PacketRing(SIZE, RECORDS, HEADERS, arena) for _ in range(3)]
+    rings = [PacketRing(SIZE, RECORDS, arena) for _ in range(3)]
     for number in range(20):
         arena.keep_from(None)
         stored = []
         for one, ring in enumerate(rings):
             packets = _packets(3 * number + one, 10)
-            _, first = ring.store(packets.reshape(-1).copy(), np.arange(10) * SIZE)
+            first = ring.keep(packets.reshape(-1).copy(), np.arange(10) * SIZE).ring_index
             stored.append((ring, first, _columns(packets)))
         for ring, first, expected in stored:
             assert np.array_equal(_gathered(ring, first), expected)
@@ -110,14 +109,14 @@ def test_packets_of_one_batch_do_not_replace_each_other() -> None:
 def test_sums_are_those_of_all_packets_so_far() -> None:
     """By hand: five words of 8 bytes, added up."""
     arena = PacketArena()
-    ring = PacketRing(SIZE, RECORDS, HEADERS, arena)
+    ring = PacketRing(SIZE, RECORDS, arena)
     ring.keep_sums()
     total = 0
     for number in range(20):
         packets = _packets(number, 7)
         region, start, place = _read(arena, packets, 3)
         arena.keep_from(None)
-        _, first = ring.store(region, start, place if number % 2 else None)
+        first = ring.keep(region, start, place if number % 2 else None).ring_index
         for packet, row in enumerate(packets):
             words = [row[at : at + 8].tobytes() for at in range(0, SIZE, 8)]
             total += sum(int.from_bytes(word, "little") for word in words)
@@ -127,6 +126,6 @@ def test_sums_are_those_of_all_packets_so_far() -> None:
 
 
 def test_packets_beyond_their_array_are_an_error() -> None:
-    ring = PacketRing(SIZE, RECORDS, HEADERS, PacketArena())
+    ring = PacketRing(SIZE, RECORDS, PacketArena())
     with pytest.raises(IndexError):
-        ring.store(np.zeros(100, np.uint8), np.array([61]))
+        ring.keep(np.zeros(100, np.uint8), np.array([61]))

@@ -134,7 +134,7 @@ def _decode(data: bytes, folder: Path) -> None:
     )
     size = lidar.packet_size * _PACKETS
     packets = np.frombuffer(data[_HEAD.size :].ljust(size, b"\0")[:size], np.uint8)
-    _, places = ring.store(packets, np.arange(_PACKETS) * lidar.packet_size)
+    places = ring.keep(packets, np.arange(_PACKETS) * lidar.packet_size).ring_index
     every = (places[:, None] + ring.column_offsets(lidar.columns_per_packet)).reshape(-1)
     place = rng.choice(every, _COLUMNS)
     word = words_of(lidar, rng, _COLUMNS)

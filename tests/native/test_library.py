@@ -48,7 +48,10 @@ def declared() -> dict[str, list[tuple[str, bool]]]:
 
 @pytest.mark.parametrize(
     "name",
-    ["Ring", "Field", "Group", "Scan", "Part", "Dissection"],
+    [
+        *("Ring", "Field", "Group", "Scan", "Part", "Dissection"),
+        *("Reader", "Numbers", "Intake", "Arrival", "Accepted"),
+    ],
 )
 def test_structs_are_those_of_the_header(name: str) -> None:
     kind = getattr(library, name)

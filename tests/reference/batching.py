@@ -5,21 +5,8 @@ other, column by column, and shares no code with the fast batcher. Where the pap
 these rules apply (N: newest stamp delivered by a sensor; t0: its first stamp; G: the largest N;
 slack: the allowed lateness, 10 ms; max-wait: the idle-source timeout):
 
-1. Intake, per sensor, in its own order of packets:
-   - A key that occurred in at most 1024 packets of the sensor before (accepted or not) makes a
-     `duplicate`; keys below 0 identify nothing.
-   - A packet without a valid column is accepted; it neither confirms nor rejects a held packet.
-   - A valid stamp outside [0, 2^31 s), or valid stamps that span more than 1 s: `bad_stamp`.
-   - A packet with a valid stamp more than 1 s from the newest accepted one is a step, and is held
-     until the next packet Q of the sensor that passes the rules above. If Q is no step, the held
-     packet is rejected and Q accepted. If all of Q is within 1 s of the first valid stamp of the
-     held packet, the step is confirmed: forward it is a gap, and both are accepted, in order;
-     backward it is a clock reset, a `ClockError`. Otherwise the held packet is rejected and Q is
-     held. End of input rejects a held packet.
-   - With the host clock, the same rules apply to the stamps of the sensor, except that a reset is
-     accepted. Then the stamps of an accepted packet become its receive time minus their age
-     relative to its largest valid stamp.
-   A held packet is delivered together with the packet that confirms it.
+1. Intake, per sensor, in its own order of packets: `tests/reference/intake.py`, without jumps. A
+   clock reset is a `ClockError`.
 2. Invalid columns are dropped as `invalid`; they have no stamp, but count as decoded.
 3. Clocks are compared when the first valid column of a sensor is delivered, with every sensor that
    already has one (comparing with the first sensor only would depend on the order). Not with the
@@ -48,31 +35,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from fractions import Fraction
 
 from mlbatch.errors import ClockError
+from tests.reference.intake import FeedPacket, Intake, StepError
 
-__all__ = ["FeedPacket", "Intake", "Outcome", "Settings", "Window", "reference_scans"]
+__all__ = ["FeedPacket", "Outcome", "Settings", "Window", "reference_scans"]
 
 SECOND_NS = 10**9
 SLACK_NS = 10**7
-DUPLICATE_REACH = 1024
-
-
-@dataclass(frozen=True, slots=True)
-class FeedPacket:
-    """A packet in order of receive time: key < 0: no identity; stamps on the sensor's clock, ns."""
-
-    sensor: int
-    host_ns: int
-    key: int
-    stamps: tuple[int, ...]
-    valid: tuple[bool, ...]
-
-    def valid_stamps(self) -> list[int]:
-        """Stamps of the valid columns, in their order."""
-        return [stamp for stamp, valid in zip(self.stamps, self.valid, strict=True) if valid]
 
 
 @dataclass(frozen=True, slots=True)
@@ -116,83 +88,6 @@ class Outcome:
     incomplete: int
 
 
-class Intake:
-    """Filter of the packets of one sensor: rule 1."""
-
-    def __init__(self, sensor: int, host_clock: bool) -> None:
-        self.sensor = sensor
-        self.host_clock = host_clock
-        self.rejected: dict[str, int] = {}
-        self.packets = 0
-        self.last_seen: dict[int, int] = {}
-        self.newest: int | None = None
-        self.held: FeedPacket | None = None
-
-    def take(self, packet: FeedPacket) -> list[FeedPacket]:
-        """Packets that are accepted with this one, in order, stamps on the common clock."""
-        if self._is_duplicate(packet.key):
-            self._reject("duplicate")
-            return []
-        stamps = packet.valid_stamps()
-        if not stamps:
-            return [packet]
-        impossible = min(stamps) < 0 or max(stamps) >= 2**31 * SECOND_NS
-        if impossible or max(stamps) - min(stamps) > SECOND_NS:
-            self._reject("bad_stamp")
-            return []
-        return [self._accept(one) for one in self._confirm(packet, stamps)]
-
-    def finish(self) -> None:
-        """End of input: reject a held packet."""
-        if self.held is not None:
-            self._reject("bad_stamp")
-            self.held = None
-
-    def _is_duplicate(self, key: int) -> bool:
-        self.packets += 1
-        if key < 0:
-            return False
-        before = self.last_seen.get(key)
-        self.last_seen[key] = self.packets
-        return before is not None and self.packets - before <= DUPLICATE_REACH
-
-    def _confirm(self, packet: FeedPacket, stamps: list[int]) -> list[FeedPacket]:
-        held = self.held
-        newest = self.newest
-        self.held = None
-        if newest is None or all(abs(stamp - newest) <= SECOND_NS for stamp in stamps):
-            if held is not None:
-                self._reject("bad_stamp")
-            return [packet]
-        if held is None:
-            self.held = packet
-            return []
-        first = held.valid_stamps()[0]
-        if any(abs(stamp - first) > SECOND_NS for stamp in stamps):
-            self._reject("bad_stamp")
-            self.held = packet
-            return []
-        if first < newest and self.host_clock:
-            self.newest = None
-        elif first < newest:
-            raise ClockError(
-                f"sensor {self.sensor}: expected stamps of one continuous clock, found a reset "
-                f"from {newest} ns back to {first} ns; cut the recording there or use --clock host"
-            )
-        return [held, packet]
-
-    def _accept(self, packet: FeedPacket) -> FeedPacket:
-        largest = max(packet.valid_stamps())
-        self.newest = largest if self.newest is None else max(self.newest, largest)
-        if not self.host_clock:
-            return packet
-        stamps = tuple(packet.host_ns - (largest - stamp) for stamp in packet.stamps)
-        return replace(packet, stamps=stamps)
-
-    def _reject(self, reason: str) -> None:
-        self.rejected[reason] = self.rejected.get(reason, 0) + 1
-
-
 @dataclass(slots=True)
 class Sensor:
     """State of one sensor after the deliveries so far."""
@@ -223,7 +118,7 @@ class Session:
     def __init__(self, settings: Settings) -> None:
         self.settings = settings
         self.slices_per_ns = settings.rate * settings.slices / SECOND_NS
-        self.intakes = [Intake(s, settings.host_clock) for s in range(settings.sensors)]
+        self.intakes = [Intake(settings.host_clock) for _ in range(settings.sensors)]
         self.sensors = [Sensor() for _ in range(settings.sensors)]
         self.offsets: dict[int, int] = {}
         self.k0: int | None = None
@@ -398,8 +293,12 @@ def reference_scans(feed: Iterable[FeedPacket], settings: Settings) -> Outcome:
     host_ns = 0
     for packet in feed:
         host_ns = packet.host_ns
-        for accepted in session.intakes[packet.sensor].take(packet):
-            session.deliver(accepted, host_ns)
+        try:
+            accepted = session.intakes[packet.sensor].take(packet)
+        except StepError as step:
+            raise ClockError(f"sensor {packet.sensor}: {step}") from step
+        for one in accepted:
+            session.deliver(one, host_ns)
     session.finish(host_ns)
     return Outcome(
         t_init_ns=None if session.k0 is None else session.bound(session.k0 * settings.slices),

@@ -13,7 +13,6 @@ from mlbatch.arrays import BoolArray, I64Array, U8Array
 from mlbatch.lidar.headers import StampedColumns
 from mlbatch.sensors.crc import crc64
 from mlbatch.sensors.ouster.profiles import (
-    COLUMN,
     CRC_SIZE,
     FUSA,
     HEADERS,
@@ -50,15 +49,6 @@ def unsigned(packets: U8Array, field_bytes: tuple[int, int]) -> I64Array:
     return value
 
 
-def column_starts(layout: PacketLayout) -> I64Array:
-    """(C,) first bytes of the columns."""
-    return layout.record_start + np.arange(layout.columns) * layout.record_size
-
-
-def _ranges(starts: I64Array, size: int) -> I64Array:
-    return np.stack([starts, np.full(len(starts), size)], axis=1)
-
-
 def column_bytes(packets: U8Array, layout: PacketLayout) -> U8Array:
     """All columns of all packets: (P, C, record size), a view."""
     size = layout.record_size
@@ -71,16 +61,6 @@ class LegacyHeaders(NamedTuple):
 
     layout: PacketLayout
     columns_per_frame: int
-
-    def read_bytes(self) -> I64Array:
-        """(k, 2) first byte and number of bytes of all that is read here."""
-        ends = column_starts(self.layout) + self.layout.record_size - LEGACY_STATUS.itemsize
-        return np.concatenate(
-            [
-                _ranges(column_starts(self.layout), LEGACY_COLUMN.itemsize),
-                _ranges(ends, LEGACY_STATUS.itemsize),
-            ]
-        )
 
     def table(self, frames: int, rank: I64Array, packets_per_frame: int) -> StampedColumns:
         """Layout for compiled loops; arguments: as in StampedColumns."""
@@ -136,11 +116,6 @@ class PacketHeaders(NamedTuple):
     columns_per_frame: int
     header: str
     serial: int
-
-    def read_bytes(self) -> I64Array:
-        """(k, 2) first byte and number of bytes of all that is read here."""
-        header = np.array([[0, self.layout.record_start]])
-        return np.concatenate([header, _ranges(column_starts(self.layout), COLUMN.itemsize)])
 
     def table(self, frames: int, rank: I64Array, packets_per_frame: int) -> StampedColumns:
         """Layout for compiled loops; arguments: as in StampedColumns."""

@@ -233,17 +233,11 @@ class OusterLidar(BaseLidar):
         # Only packets with STANDARD headers have a checksum.
         checks = check_crc and not layout.legacy and described.header == STANDARD
         headers = _headers(described)
-        self._header_bytes = np.array([[0, self.packet_size]]) if checks else headers.read_bytes()
         self.reader = HeaderReader(
             headers.table(frame_ids, rank, in_window),
             has_number=True,
             wrong_crc=wrong_crc if checks else None,
         )
-
-    @property
-    def header_bytes(self) -> I64Array:
-        """Headers of packet and columns."""
-        return self._header_bytes
 
     def is_imu(self, size: int) -> bool:
         """Whether a payload of this size is an IMU packet; old ROS drivers append one byte."""
