@@ -14,7 +14,6 @@ from typing import NamedTuple
 import numpy as np
 
 from mlbatch.arrays import BoolArray, F64Array, I64Array, U16Array, U32Array, median
-from mlbatch.lidar.geometry import rotor_ticks
 from mlbatch.native.library import Numbers, address, library
 from mlbatch.types import ColumnHeaders
 from mlbatch.units import NS_PER_S
@@ -168,14 +167,15 @@ class GapLoss:
         Of the stamps, on the sensor's clock, only the first of each packet are read.
         """
         measured = np.flatnonzero(headers.valid.any(axis=1))
+        encoder = np.ascontiguousarray(headers.encoder)
         packets = _Packets(
             # A copy, so that the stamps of all columns are not kept in memory.
             headers.stamp_ns[:, 0].copy(),
             host_ns,
-            rotor_ticks(headers.encoder[:, 0]).astype(np.uint32),
-            rotor_ticks(headers.encoder[:, -1]).astype(np.uint32),
-            # The higher bits of the words are cut off.
-            (headers.encoder >> (32 - _BIN_BITS)).astype(np.uint16),
+            # The low 32 bits of the words, and the higher 16 of them: copies without the others.
+            encoder.view("<u4")[:, 0].copy(),
+            encoder.view("<u4")[:, -2].copy(),
+            encoder.view("<u2")[:, 1::4].copy(),
         )
         if len(measured) < len(packets):
             packets = packets.take(measured)
@@ -302,7 +302,8 @@ def _period_ns(step_ns: F64Array, packet_ns: float) -> float:
     pair_ns = (step_ns[1:] + step_ns[:-1]) / 2
     if len(pair_ns) < _MIN_STEPS:
         return packet_ns
-    low_ns = float(np.quantile(pair_ns, _QUANTILE))
+    # By this method numpy does not import `numpy.ma`.
+    low_ns = float(np.quantile(pair_ns, _QUANTILE, method="inverted_cdf"))
     near = pair_ns[np.abs(pair_ns - low_ns) <= _TOLERANCE * low_ns]
     # If most packets are lost, the remaining steps show no period.
     return float(near.mean()) if len(near) >= _MIN_SHARE * len(pair_ns) else packet_ns
