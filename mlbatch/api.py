@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
-from mlbatch.discovery.inspect import Inspection
-from mlbatch.discovery.inspect import inspect as inspect_recordings
 from mlbatch.errors import UsageError
 from mlbatch.outputs.read import read as read_output
 from mlbatch.outputs.scan import Scan
+from mlbatch.pipeline.inspect import Inspection
+from mlbatch.pipeline.inspect import inspect as inspect_recordings
 from mlbatch.python.options import (
     AnyPath,
     ConvertOptions,

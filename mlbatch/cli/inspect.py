@@ -54,7 +54,7 @@ def inspect(
     """Show streams, sensors, modes, rates, loss, clocks and extrinsics (from the first 10 s)."""
     from mlbatch.cli.progress import progress_bar
     from mlbatch.cli.tables import fits, paragraph, table_lines
-    from mlbatch.discovery.inspect import inspect as inspect_recordings
+    from mlbatch.pipeline.inspect import inspect as inspect_recordings
     from mlbatch.readers.inputs import expand
 
     prints_rig = write_rig == Path("-")

@@ -47,7 +47,7 @@ NEEDLESS = (
     *("mlbatch.readers.formats.pcapng", "mlbatch.readers.formats.rosbag1"),
     *("mlbatch.readers.bag.recording", "mlbatch.readers.bag.packet_messages"),
     *("mlbatch.readers.bag.folder", "mlbatch.readers.bag.clouds", "mlbatch.faults.replay"),
-    *("mlbatch.frames.urdf", "mlbatch.discovery.inspect", "mlbatch.compare.compare"),
+    *("mlbatch.frames.urdf", "mlbatch.pipeline.inspect", "mlbatch.compare.compare"),
     *("mlbatch.verify.verdict", "mlbatch.api"),
     *("mlbatch.writers.formats.npz", "mlbatch.writers.formats.ply"),
     *("mlbatch.writers.formats.rosbag1", "mlbatch.cli.compare"),

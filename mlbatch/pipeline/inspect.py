@@ -16,12 +16,6 @@ from mlbatch.clocks.compare import SYNCHRONISED, Comparison, compare
 from mlbatch.clocks.host_offset import HostOffset, describe_off
 from mlbatch.clocks.timescale import format_difference, timescale
 from mlbatch.clocks.watch import ClockEstimate, ClockWatch
-from mlbatch.discovery.contents import (
-    RecordingReport,
-    TopicCounter,
-    TopicReport,
-    recording_report,
-)
 from mlbatch.discovery.crowd import MOST_KINDS
 from mlbatch.discovery.discover import (
     Discovery,
@@ -39,6 +33,12 @@ from mlbatch.discovery.router import Role
 from mlbatch.discovery.sampler import clock_watch, split_by_kind
 from mlbatch.discovery.types import DetectedSensor, PacketKind
 from mlbatch.errors import RecordingError, RigError
+from mlbatch.pipeline.contents import (
+    RecordingReport,
+    TopicCounter,
+    TopicReport,
+    recording_report,
+)
 from mlbatch.readers import merge, open_recordings
 from mlbatch.readers.bag.clouds import CloudRecording
 from mlbatch.readers.byte_records import rows

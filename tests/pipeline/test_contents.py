@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from mlbatch.discovery.contents import recording_report
+from mlbatch.pipeline.contents import recording_report
 from mlbatch.readers import open_recording
 from mlbatch.types import StreamTable
 from tests.builders.bags import Body, Recorded, fixture_messages
