@@ -17,7 +17,7 @@ from typing import NamedTuple, NoReturn
 import numpy as np
 
 from mlbatch import sensors
-from mlbatch.arrays import BoolArray, rows_of
+from mlbatch.arrays import BoolArray, U8Array, rows_of
 from mlbatch.discovery.sampler import Sampler
 from mlbatch.discovery.types import DetectedSensor, PacketKind
 from mlbatch.errors import RecordingError, RigError
@@ -424,6 +424,13 @@ def describe(sampler: Sampler, kind: PacketKind) -> str | None:
     if kind in sampler.released:
         return sampler.released[kind]
     return sensors.describe(kind.size, sampler.kinds[kind].arrays()[0])
+
+
+def describe_each(size: int, packets: U8Array) -> str | None:
+    """Description of packets (k, size) one by one: a lidar's, since a damaged one may be first."""
+    texts = [sensors.describe(size, packet[None]) for packet in packets]
+    known = [text for text in texts if text]
+    return next((text for text in known if "lidar" in text), known[0] if known else None)
 
 
 def release(sampler: Sampler, kinds: Iterable[PacketKind]) -> None:

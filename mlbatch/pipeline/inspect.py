@@ -8,14 +8,12 @@ from pathlib import Path
 
 import numpy as np
 
-from mlbatch import sensors
 from mlbatch.arrays import F64Array
 from mlbatch.batching.intake import NEVER, extremes
-from mlbatch.batching.loss import PacketLoss
 from mlbatch.clocks.compare import SYNCHRONISED, Comparison, compare
 from mlbatch.clocks.host_offset import HostOffset, describe_off
 from mlbatch.clocks.timescale import format_difference, timescale
-from mlbatch.clocks.watch import ClockEstimate, ClockWatch
+from mlbatch.clocks.watch import ClockEstimate
 from mlbatch.discovery.crowd import MOST_KINDS
 from mlbatch.discovery.discover import (
     Discovery,
@@ -26,22 +24,25 @@ from mlbatch.discovery.discover import (
     packet_types,
 )
 from mlbatch.discovery.interleaved import shared_address
-from mlbatch.discovery.match import describe
+from mlbatch.discovery.match import describe, describe_each
 from mlbatch.discovery.overlap import SharedLidars, iso
 from mlbatch.discovery.probe import first_seconds, is_without_packets
 from mlbatch.discovery.router import Role
-from mlbatch.discovery.sampler import clock_watch, split_by_kind
+from mlbatch.discovery.sampler import split_by_kind
 from mlbatch.discovery.types import DetectedSensor, PacketKind
 from mlbatch.errors import RecordingError, RigError
+from mlbatch.native.arena import PacketArena
 from mlbatch.pipeline.contents import (
     RecordingReport,
     TopicCounter,
     TopicReport,
     recording_report,
 )
+from mlbatch.pipeline.ingest import Ingest
+from mlbatch.pipeline.job import Job
+from mlbatch.pipeline.session import sensors_of
 from mlbatch.readers import merge, open_recordings
 from mlbatch.readers.bag.clouds import CloudRecording
-from mlbatch.readers.byte_records import rows
 from mlbatch.rig.rig import (
     DEFAULT_BODY_FRAME,
     Rig,
@@ -314,9 +315,8 @@ def inspect(
         to_convert=False,
     )
     early = frozenset(discovery.sampler.kinds)
-    others: dict[PacketKind, _OtherPackets] = {}
     topics = TopicCounter.subscribed(discovery.recordings, (one.topic for one in table.streams))
-    measured = _measure(discovery, others, topics, progress, whole=whole)
+    measured = _measure(discovery, topics, progress, whole=whole)
     types = packet_types(discovery.recordings)
     if not discovery.sampler.kinds and not types:
         _refuse_damaged(discovery)
@@ -325,8 +325,7 @@ def inspect(
     )
     for sensor in discovery.sensors:
         sensor.selector = _selector(table, sensor)
-    findings = [(sensor.name, one.watch.estimate()) for sensor, one in measured.items()]
-    known = [(name, finding) for name, finding in findings if finding is not None]
+    known = measured.estimates()
     files = {str(path): path for path in discovery.examined}
     return Inspection(
         streams=streams,
@@ -340,7 +339,7 @@ def inspect(
         notes=(
             *_notes(discovery),
             *_late_notes(discovery, early),
-            *_other_lidars(discovery, others),
+            *measured.other_lidars(discovery),
             *_clock_notes(known),
         ),
         clocks=compare(known) if known else None,
@@ -430,65 +429,90 @@ def _notes(discovery: Discovery) -> Iterator[str]:
 
 
 class _Measured:
-    """Loss and clock of one sensor; first: its first timestamp and receive time, ns."""
+    """Packets of the sensors as a run takes them: their loss, clocks, and those of no sensor.
 
-    def __init__(self, sensor: DetectedSensor) -> None:
-        lidar = sensor.lidar
-        packet_ns = lidar.columns_per_packet * lidar.column_period_ns
-        self.loss = PacketLoss(lidar.sequence_modulus, packet_ns)
-        self.watch: ClockWatch = clock_watch(lidar)
-        self.first: tuple[int, int] | None = None
-        # Kinds with a packet of this sensor; one that begins late may be of another.
-        self.sent: set[PacketKind] = set()
+    loss: packets lost of each sensor; first: first timestamp and receive time of each, ns.
+    """
 
-    @property
-    def offset_ns(self) -> int | None:
+    def __init__(self, discovery: Discovery) -> None:
+        self._arena = PacketArena()
+        self._sensors = sensors_of(discovery, Job(()), self._arena)
+        self._ingest = Ingest(discovery.router, self._sensors)
+        # Steps of a clock are shown, not refused: then only receive times continue.
+        self._intakes = [sensor.intake(host_clock=True) for sensor in self._sensors]
+        self._firsts: list[tuple[int, int] | None] = [None for _ in self._sensors]
+        # Of each sensor, kinds with a packet of it; one that begins late may be of another.
+        self.sent: list[set[PacketKind]] = [set() for _ in self._sensors]
+
+    def add(self, batch: PacketBatch) -> None:
+        """Add all packets of a batch."""
+        self._arena.keep_from(None)
+        for number, arrival in enumerate(self._ingest.columns(batch).arrivals):
+            if arrival is None or not len(arrival.host_ns):
+                continue
+            sensor = self._sensors[number]
+            headers = arrival.headers
+            at = arrival.position
+            self.sent[number].update(kind for kind, _ in split_by_kind(batch.take(at)))
+            if sensor.clock.has_receive_times:
+                _, newest_ns = extremes(headers)
+                known = newest_ns > NEVER
+                sensor.clock.watch.add(newest_ns[known], arrival.host_ns[known])
+            if self._firsts[number] is None and headers.valid.any():
+                row, column = np.argwhere(headers.valid)[0]
+                self._firsts[number] = (
+                    int(headers.stamp_ns[row, column]),
+                    int(arrival.host_ns[row]),
+                )
+            self._intakes[number].accept(arrival)
+
+    def lost(self, number: int) -> int:
+        """Lost packets of a sensor."""
+        return self._intakes[number].loss.lost
+
+    def estimates(self) -> list[tuple[str, ClockEstimate]]:
+        """Name and clock of each sensor whose packets have receive times."""
+        found = ((sensor.name, sensor.clock.watch.estimate()) for sensor in self._sensors)
+        return [(name, estimate) for name, estimate in found if estimate is not None]
+
+    def first(self, number: int) -> tuple[int, int] | None:
+        """First timestamp of a sensor and its receive time, ns; None without."""
+        return self._firsts[number]
+
+    def offset_ns(self, number: int) -> int | None:
         """Clock minus the capture host's; by the log time of a message where that is all."""
-        estimate = self.watch.estimate()
+        estimate = self._sensors[number].clock.watch.estimate()
         if estimate is not None:
             return estimate.offset_ns
-        return None if self.first is None else self.first[0] - self.first[1]
+        first = self._firsts[number]
+        return None if first is None else first[0] - first[1]
 
-
-@dataclass(slots=True)
-class _OtherPackets:
-    """Packets of no sensor among those of a sensor's kind; what: a lidar's description, or ""."""
-
-    packets: int = 0
-    what: str = ""
-
-
-def _other_lidars(
-    discovery: Discovery, others: Mapping[PacketKind, _OtherPackets]
-) -> Iterator[str]:
-    """Lidars that share the address of a sensor."""
-    for kind, one in sorted(others.items()):
-        if one.what:
-            stream = discovery.sampler.table.streams[kind.stream]
-            yield (
-                f"{stream}: {one.what} as well; {one.packets} packets are of no sensor; "
-                "give its --metadata"
-            )
+    def other_lidars(self, discovery: Discovery) -> Iterator[str]:
+        """Lidars that share the address of a sensor."""
+        kinds = {kind for sensor in discovery.sensors for kind in sensor.kinds}
+        for (kind, _), packets in sorted(self._ingest.unassigned.items(), key=lambda one: one[0]):
+            what = describe_each(kind.size, packets.sample) if kind in kinds else None
+            if what is not None and "lidar" in what:
+                stream = discovery.sampler.table.streams[kind.stream]
+                yield (
+                    f"{stream}: {what} as well; {packets.packets} packets are of no sensor; "
+                    "give its --metadata"
+                )
 
 
 def _measure(
-    discovery: Discovery,
-    others: dict[PacketKind, _OtherPackets],
-    topics: TopicCounter,
-    progress: Progress | None,
-    *,
-    whole: bool,
-) -> dict[DetectedSensor, _Measured]:
+    discovery: Discovery, topics: TopicCounter, progress: Progress | None, *, whole: bool
+) -> _Measured:
     """Loss and clock of each sensor, in the first seconds or the whole session.
 
-    others: gets the packets of no sensor; topics: gets the messages of the others; whole: packets
-    of all kinds are counted again, with those that begin later.
+    topics: gets the messages of the others; whole: packets of all kinds are counted again, with
+    those that begin later.
     """
     sampler = discovery.sampler
     if whole:
         sampler.restart_counts()
     late: set[PacketKind] = set()
-    measured = {sensor: _Measured(sensor) for sensor in discovery.sensors}
+    measured = _Measured(discovery)
     recordings = discovery.recordings
     size_bytes = sum(recording.size_bytes for recording in recordings)
     shared = SharedLidars()
@@ -506,46 +530,13 @@ def _measure(
         topics.add(batch.messages)
         if progress is not None:
             progress(sum(recording.position_bytes for recording in recordings), size_bytes)
-        parts = split_by_kind(batch)
-        for kind, index in sampler.crowd.followed(batch, parts) if whole else parts:
-            if whole and sampler.count(kind, index, batch):
-                late.add(kind)
-                # It may be of one of the sensors.
-                discovery.router.route(kind, sampler.kinds[kind].arrays()[0][0])
-            owned = np.zeros(len(index), np.bool_)
-            owners = [sensor for sensor in discovery.sensors if kind in sensor.kinds]
-            for sensor in owners:
-                lidar = sensor.lidar
-                one = measured[sensor]
-                packets = rows(batch.data, batch.start[index], lidar.packet_size)
-                own = lidar.sent_by_me(packets)
-                owned |= own
-                if own.any():
-                    one.sent.add(kind)
-                good = own & (lidar.faults(packets) == 0)
-                host_ns = batch.host_ns[index[good]]
-                headers = lidar.column_headers(packets[good], host_ns)
-                one.loss.add(lidar.sequence(packets[good]), headers, host_ns)
-                if sampler.has_receive_times(sensor):
-                    _, newest_ns = extremes(headers)
-                    known = newest_ns > NEVER
-                    one.watch.add(newest_ns[known], host_ns[known])
-                if one.first is None and headers.valid.any():
-                    row, column = np.argwhere(headers.valid)[0]
-                    one.first = int(headers.stamp_ns[row, column]), int(host_ns[row])
-            if owners and not owned.all():
-                left = index[~owned]
-                other = others.setdefault(kind, _OtherPackets())
-                other.packets += len(left)
-                row_bytes = batch.data[batch.start[left[0]] + np.arange(kind.size)]
-                what = "" if other.what else sensors.describe(kind.size, row_bytes[None]) or ""
-                if "lidar" in what:
-                    other.what = what
-    for sensor, one in measured.items():
-        sensor.kinds -= late - one.sent
-    # Late packets of no sensor are a stream of their own, not others among those of a sensor.
-    for kind in late.difference(*(sensor.kinds for sensor in discovery.sensors)):
-        others.pop(kind, None)
+        if whole:
+            for kind, index in sampler.crowd.followed(batch, split_by_kind(batch)):
+                if sampler.count(kind, index, batch):
+                    late.add(kind)
+        measured.add(batch)
+    for sensor, sent in zip(discovery.sensors, measured.sent, strict=True):
+        sensor.kinds -= late - sent
     return measured
 
 
@@ -578,7 +569,7 @@ def _clocks_as_json(clocks: Comparison) -> dict[str, object]:
 def _stream_report(
     discovery: Discovery,
     kind: PacketKind,
-    measured: Mapping[DetectedSensor, _Measured],
+    measured: _Measured,
     types: Mapping[str, str],
 ) -> StreamReport:
     """Report of one kind; types: message types by topic."""
@@ -595,8 +586,9 @@ def _stream_report(
         first_host_ns=samples.first_host_ns,
         last_host_ns=samples.last_host_ns,
     )
-    sensor = next((one for one in discovery.sensors if kind in one.kinds), None)
-    if sensor is None:
+    owners = (number for number, one in enumerate(discovery.sensors) if kind in one.kinds)
+    number = next(owners, None)
+    if number is None:
         what = describe(sampler, kind) or ""
         missing = "decoder" if lacks_decoder(what) else "metadata" if "lidar" in what else ""
         is_owned = route.role in (Role.IMU, Role.BAD_SIZE)
@@ -606,9 +598,10 @@ def _stream_report(
             sensor=discovery.sensors[route.sensors[0]].name if is_owned else "",
             missing=missing,
         )
+    sensor = discovery.sensors[number]
     lidar = sensor.lidar
-    first = measured[sensor].first
-    offset_ns = measured[sensor].offset_ns
+    first = measured.first(number)
+    offset_ns = measured.offset_ns(number)
     return replace(
         report,
         what=f"{lidar.model} {lidar.mode}",
@@ -616,7 +609,7 @@ def _stream_report(
         model=lidar.model,
         mode=lidar.mode,
         serial=lidar.serial,
-        lost=measured[sensor].loss.lost,
+        lost=measured.lost(number),
         timescale="" if first is None else timescale(*first),
         offset_ms=None if offset_ns is None else offset_ns / NS_PER_MS,
         calibration=Path(lidar.calibration).name,

@@ -7,13 +7,12 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from mlbatch import sensors
 from mlbatch.arrays import U8Array
 from mlbatch.clocks.host_offset import HostOffset, describe_off
 from mlbatch.clocks.timescale import describe_time
 from mlbatch.discovery.crowd import MOST_KINDS
 from mlbatch.discovery.discover import not_in_rig
-from mlbatch.discovery.match import describe
+from mlbatch.discovery.match import describe, describe_each
 from mlbatch.discovery.types import Note, PacketKind
 from mlbatch.pipeline.passthrough import PASS_REASONS
 from mlbatch.pipeline.point_notes import point_notes
@@ -465,15 +464,11 @@ def _what(run: Conversion, kind: PacketKind, ignored: bool) -> str:
 
 
 def _described(run: Conversion, kind: PacketKind, sample: U8Array) -> str:
-    texts = [sensors.describe(kind.size, row[None]) for row in sample]
-    known = [text for text in texts if text]
-    # A damaged packet may be the first.
-    lidars = [text for text in known if "lidar" in text]
-    if known:
-        return (lidars or known)[0]
-    if kind in run.session.setup.sampler.kinds:
-        return describe(run.session.setup.sampler, kind) or "unknown"
-    return "unknown"
+    sampler = run.session.setup.sampler
+    text = describe_each(kind.size, sample)
+    if text is None and kind in sampler.kinds:
+        text = describe(sampler, kind)
+    return text or "unknown"
 
 
 def _timing(run: Conversion) -> Timing:

@@ -14,7 +14,7 @@ from mlbatch.discovery.discover import Discovery, discover, refuse_absent, refus
 from mlbatch.discovery.match import release
 from mlbatch.discovery.probe import is_without_packets
 from mlbatch.discovery.sampler import clock_watch
-from mlbatch.discovery.types import DetectedSensor, Note, PacketKind
+from mlbatch.discovery.types import Note, PacketKind
 from mlbatch.errors import RecordingError
 from mlbatch.native import require_library
 from mlbatch.native.arena import PacketArena
@@ -75,9 +75,7 @@ class Session:
         # Packets are decoded where they were read, unless most bytes there are of others, which
         # would be kept as long.
         self._reads_into_arena = self.setup.sampler.share_of(kinds) >= _MOST
-        self.sensors: list[Sensor] = []
-        for found in self.setup.sensors:
-            self.sensors.append(self._sensor(found))
+        self.sensors = sensors_of(self.setup, job, self._arena)
         release(self.setup.sampler, kinds & self.setup.sampler.kinds.keys())
         self.refuse_untimed()
         self.replay = self._replay()
@@ -109,31 +107,6 @@ class Session:
         """Return which packets (P, size) of no sensor the user left out: (P,) bool."""
         stream = self.setup.sampler.table.streams[kind.stream]
         return self.setup.ignored.packets(stream, kind, packets)
-
-    def _sensor(self, found: DetectedSensor) -> Sensor:
-        """The next sensor, with an empty ring and ledger."""
-        job = self.job
-        rig = found.rig
-        lidar = found.lidar
-        sampler = self.setup.sampler
-        ring_base = 0
-        if self.sensors:
-            last = self.sensors[-1]
-            ring_base = last.ring_base + max(last.lidar.channels, int(last.lidar.channel.max()) + 1)
-        return Sensor(
-            index=len(self.sensors),
-            detected=found,
-            clock=SensorClock(
-                by_host=job.selection.host_clock or (rig is not None and rig.clock == "host"),
-                offset_ns=found.offset_ns,
-                has_receive_times=sampler.has_receive_times(found),
-                watch=clock_watch(lidar),
-            ),
-            limits=limits(job, rig),
-            ring_base=ring_base,
-            columns_per_s=sampler.columns_per_s(found),
-            ring=new_ring(lidar, self._arena),
-        )
 
     def _replay(self) -> FaultReplay | None:
         """Replay of the job's faults, None without."""
@@ -286,6 +259,34 @@ class Session:
         if self.job.strict and note.code not in ACCEPTED:
             raise RecordingError(f"{note.message} ({note.code}, an error because of --strict)")
         self.notes.append(note)
+
+
+def sensors_of(setup: Discovery, job: Job, arena: PacketArena) -> list[Sensor]:
+    """The sensors of a session with empty rings and ledgers; arena: where packets are kept."""
+    sampler = setup.sampler
+    sensors: list[Sensor] = []
+    ring_base = 0
+    for found in setup.sensors:
+        rig = found.rig
+        lidar = found.lidar
+        sensors.append(
+            Sensor(
+                index=len(sensors),
+                detected=found,
+                clock=SensorClock(
+                    by_host=job.selection.host_clock or (rig is not None and rig.clock == "host"),
+                    offset_ns=found.offset_ns,
+                    has_receive_times=sampler.has_receive_times(found),
+                    watch=clock_watch(lidar),
+                ),
+                limits=limits(job, rig),
+                ring_base=ring_base,
+                columns_per_s=sampler.columns_per_s(found),
+                ring=new_ring(lidar, arena),
+            )
+        )
+        ring_base += max(lidar.channels, int(lidar.channel.max()) + 1)
+    return sensors
 
 
 def limits(job: Job, rig: RigSensor | None) -> Limits:

@@ -29,6 +29,8 @@ from tests.builders.sessions import (
     write_metadata,
     write_session,
 )
+from tests.builders.velodyne import VelodyneSpec
+from tests.builders.vendor_sessions import framed, velodyne_payloads, write_capture
 
 CAPTURE = FIXTURE / "two_lidars.pcap"
 OUSTER = RECORDINGS / "ouster"
@@ -386,3 +388,23 @@ def test_the_whole_of_a_short_recording_is_its_first_seconds(shell: Shell) -> No
     ten = json.loads(shell(f"inspect {CAPTURE} --json").out)
     whole = json.loads(shell(f"inspect {CAPTURE} --whole --json").out)
     assert {**ten, "whole": True} == whole
+
+
+@pytest.mark.parametrize("whole", ["", "--whole"])
+def test_loss_is_that_of_a_conversion(shell: Shell, tmp_path: Path, whole: str) -> None:
+    """Also of a sensor whose packets carry no number, among duplicates and damaged timestamps."""
+    spec = VelodyneSpec("VLP-16", "strongest")
+    sent = velodyne_payloads(spec, 800)
+    lost = {200, 201, 500}
+    kept = [one for number, one in enumerate(sent) if number not in lost]
+    at_ns, payload = kept[300]
+    # The last six bytes are the timestamp, us of the hour, and two factory bytes.
+    kept[300] = at_ns, payload[:-6] + (3_000_000_000).to_bytes(4, "little") + payload[-2:]
+    kept.insert(100, kept[99])
+    capture = write_capture(tmp_path, framed(kept, "10.0.0.9", 2368))
+    (stream,) = json.loads(shell(f"inspect {capture} --json {whole}").out)["streams"]
+    outcome = shell(f"convert {capture} --identity-extrinsics --dry-run --quiet --keep-partial")
+    (sensor,) = json.loads(outcome.out)["sensors"]
+    assert sensor["packets"]["rejected"] == {"bad_stamp": 1, "duplicate": 1}
+    # The damaged packet is missing, too, where packets are counted by their timestamps.
+    assert stream["lost"] == sensor["packets"]["lost"] == len(lost) + 1
