@@ -149,7 +149,7 @@ def _rig(rig: str) -> str:
 
 def _calibrations(recordings: list[Path]) -> str:
     """Digest of all files that may be calibrations in the folders of recordings."""
-    from mlbatch.discovery.probe import may_be_calibration
+    from mlbatch.discovery.calibrations import may_be_calibration
 
     digest = hashlib.sha256()
     for folder in sorted({path.resolve().parent for path in recordings}):

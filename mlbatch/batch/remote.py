@@ -172,7 +172,7 @@ def describe(urls: Sequence[str]) -> Iterator[str]:
 
 def calibrations(url: str) -> list[RemoteFile]:
     """Files in the folder of a recording that may be calibrations, as `convert` looks for them."""
-    from mlbatch.discovery.probe import CALIBRATION_SUFFIXES, MAX_CALIBRATION_FILE_BYTES
+    from mlbatch.discovery.calibrations import CALIBRATION_SUFFIXES, MAX_CALIBRATION_FILE_BYTES
 
     folder = url.rpartition("/")[0]
     return [

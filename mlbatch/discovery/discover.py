@@ -14,9 +14,16 @@ import numpy as np
 
 from mlbatch import sensors
 from mlbatch.arrays import BoolArray, F64Array, U8Array
-from mlbatch.clocks.compare import COMPARABLE_NS, refuse_incomparable
+from mlbatch.clocks.compare import refuse_incomparable
 from mlbatch.clocks.timescale import gps_utc_s, tai_utc_s
+from mlbatch.discovery.calibrations import (
+    MetadataCollector,
+    fault_of,
+    find_calibrations,
+    read_given,
+)
 from mlbatch.discovery.extrinsics import place
+from mlbatch.discovery.first_seconds import FirstSeconds, with_clouds
 from mlbatch.discovery.gravity import gravity_notes
 from mlbatch.discovery.interleaved import shared_address
 from mlbatch.discovery.match import (
@@ -29,14 +36,6 @@ from mlbatch.discovery.match import (
     match_rig,
     senders,
 )
-from mlbatch.discovery.probe import (
-    MetadataCollector,
-    fault_of,
-    find_calibrations,
-    probe,
-    read_given,
-    with_clouds,
-)
 from mlbatch.discovery.router import Router
 from mlbatch.discovery.sampler import Sampler
 from mlbatch.discovery.types import DetectedSensor, Note, PacketKind
@@ -46,7 +45,7 @@ from mlbatch.lidar.interface import Calibration
 from mlbatch.rig.rig import Rig, RigSensor, read_rig
 from mlbatch.sensors.advice import with_advice
 from mlbatch.types import Recording, Stream, StreamTable
-from mlbatch.units import NS_PER_MS, NS_PER_S
+from mlbatch.units import NS_PER_S
 
 if TYPE_CHECKING:
     from mlbatch.readers.bag.cloud_topics import CloudTopics
@@ -117,8 +116,7 @@ class Discovery:
     sensors: list[DetectedSensor]  # in the order of `lidar_id`
     frame_id: str  # of the body
     router: Router
-    sampler: Sampler
-    recordings: Sequence[Recording]  # to read: decoded clouds are packets
+    first: FirstSeconds
     examined: list[Path]  # files that may be calibrations
     # Why matching calibrations cannot be used.
     unusable: tuple[str, ...] = ()
@@ -129,6 +127,16 @@ class Discovery:
     noted: set[PacketKind] = field(default_factory=set)
     tree: FrameTree = field(default_factory=FrameTree)  # static frames of the recording
     ignored: Ignored = field(default_factory=lambda: Ignored())
+
+    @property
+    def sampler(self) -> Sampler:
+        """Samples of all streams."""
+        return self.first.sampler
+
+    @property
+    def recordings(self) -> Sequence[Recording]:
+        """What to read: decoded clouds are packets."""
+        return self.first.recordings
 
     def frames(self) -> dict[str, F64Array]:
         """Return (4, 4) body_from_frame, m, of the recording's static frames, by name."""
@@ -156,7 +164,9 @@ def discover(
     if to_convert:
         _refuse_clouds_of_rig(rig, refused, selection)
     # `inspect` also counts these packets.
-    sampler, collector = probe(recordings, table, clouds if to_convert else None)
+    first = FirstSeconds(recordings, table, clouds, cut_clouds=to_convert)
+    sampler = first.sampler
+    collector = first.metadata
     paths = [recording.path for recording in recordings]
     calibrations: list[Calibration] = []
     examined: list[Path] = []
@@ -198,11 +208,10 @@ def discover(
     notes += _unused(matched.sensors, selection.metadata)
     for sensor in chosen:
         sensor.offset_ns = _rig_offset_ns(sampler, sensor)
-    if clouds is not None:
-        notes += _clouds_apart(sampler, chosen, clouds)
+    notes += first.clouds_apart(chosen)
     if to_convert:
         _refuse_shared_addresses(sampler, chosen)
-        _refuse_incomparable_clocks(sampler, chosen, selection, clouds)
+        _refuse_incomparable_clocks(first, chosen, selection)
     extrinsics = place(
         chosen,
         collector.extrinsics,
@@ -228,8 +237,7 @@ def discover(
         sensors=chosen,
         frame_id=extrinsics.body_frame,
         router=router,
-        sampler=sampler,
-        recordings=recordings,
+        first=first,
         examined=examined,
         unusable=tuple(
             f"{table.streams[kind.stream]}: {why}" for kind, why in matched.failures.items()
@@ -483,36 +491,6 @@ def _cloud_notes(
             yield Note("cloud_time", "", f"{topic}: {text}")
 
 
-# Clouds farther apart by their log times need more than different delays of their drivers.
-_CLOUDS_APART_NS = 150 * NS_PER_MS
-
-
-def _clouds_apart(
-    sampler: Sampler, chosen: Sequence[DetectedSensor], clouds: CloudTopics
-) -> Iterator[Note]:
-    """A warning where the clouds of two sensors are late against their log times by other times.
-
-    Differences that a run refuses have an error of their own.
-    """
-    cloudy = [sensor for sensor in chosen if not sampler.has_receive_times(sensor)]
-    ahead_ns = {sensor.name: _ahead_ns(sampler, sensor, clouds) for sensor in cloudy}
-    known = {name: ns for name, ns in ahead_ns.items() if ns is not None}
-    if len(known) < 2:
-        return
-    first = min(known, key=lambda name: known[name])
-    last = max(known, key=lambda name: known[name])
-    apart_ns = known[last] - known[first]
-    if _CLOUDS_APART_NS < apart_ns <= COMPARABLE_NS:
-        yield Note(
-            "cloud_time",
-            "",
-            f"by the log times of their messages the points of {last} are "
-            f"{apart_ns / NS_PER_MS:.0f} ms later than those of {first}: their clocks, or the "
-            "zeros of their times, may differ; check that both see walls at one place in motion, "
-            "and give clock.offset_s or points: {from: ...} in the rig",
-        )
-
-
 def _refuse_left_out(texts: Sequence[str], recordings: Sequence[Recording]) -> None:
     """Raise RecordingError if lidars of the session would be left out whole; texts: of each."""
     if texts:
@@ -725,14 +703,12 @@ def _refuse_shared_addresses(sampler: Sampler, chosen: Sequence[DetectedSensor])
 
 
 def _refuse_incomparable_clocks(
-    sampler: Sampler,
-    chosen: Sequence[DetectedSensor],
-    selection: SensorSelection,
-    clouds: CloudTopics | None,
+    first: FirstSeconds, chosen: Sequence[DetectedSensor], selection: SensorSelection
 ) -> None:
     """Raise ClockError for clocks that cannot be merged, before extrinsics are asked for."""
     if selection.aligned:
         return
+    sampler = first.sampler
     offsets_ns: list[tuple[str, int | None]] = []
     for sensor in chosen:
         by_host = selection.host_clock or (sensor.rig is not None and sensor.rig.clock == "host")
@@ -747,43 +723,4 @@ def _refuse_incomparable_clocks(
                 has_receive_times=all(map(sampler.has_receive_times, chosen)),
             )
         except ClockError as err:
-            raise ClockError(f"{err}{_coarse_offsets(sampler, chosen, clouds)}") from err
-
-
-def _coarse_offsets(
-    sampler: Sampler, chosen: Sequence[DetectedSensor], clouds: CloudTopics | None
-) -> str:
-    """Text for a rig with the offsets of clouds, by the log times of their messages; or ""."""
-    if clouds is None:
-        return ""
-    ahead_ns = {sensor.name: _ahead_ns(sampler, sensor, clouds) for sensor in chosen}
-    known = {name: ns for name, ns in ahead_ns.items() if ns is not None}
-    unknown = [name for name in ahead_ns if name not in known]
-    if unknown:
-        return f"; the log times of {', '.join(unknown)} do not show the offset"
-    reference = min(known, key=lambda name: abs(known[name]))
-    lines = []
-    for sensor in chosen:
-        offset_ns = sensor.offset_ns + known[reference] - known[sensor.name]
-        if abs(known[reference] - known[sensor.name]) > COMPARABLE_NS:
-            seconds = round(offset_ns / NS_PER_MS) / (NS_PER_S // NS_PER_MS)
-            lines.append(f"{sensor.name} clock: {{offset_s: {seconds:.3f}}}")
-    return (
-        f": {', '.join(lines)} (by log times of messages: coarse, to some 0.01 s, as the delays "
-        "of the drivers differ)"
-        if lines
-        else ""
-    )
-
-
-def _ahead_ns(sampler: Sampler, sensor: DetectedSensor, clouds: CloudTopics) -> int | None:
-    """Newest points of a sensor minus the receive times, with the offset of the rig."""
-    if sampler.has_receive_times(sensor):
-        found = sampler.clock_offset_ns(sensor)
-    else:
-        streams = [sampler.table.streams[number] for number in sensor.streams]
-        all_ns = [
-            clouds.ahead_ns.get((stream.topic, clouds.frames.get(stream, ""))) for stream in streams
-        ]
-        found = max((ns for ns in all_ns if ns is not None), default=None)
-    return None if found is None else found + sensor.offset_ns
+            raise ClockError(f"{err}{first.rig_offsets(chosen)}") from err

@@ -20,8 +20,7 @@ import numpy as np
 from mlbatch import sensors
 from mlbatch.arrays import I64Array
 from mlbatch.batching.intake import NEVER, extremes
-from mlbatch.discovery.crowd import Crowd
-from mlbatch.discovery.sampler import split_by_kind
+from mlbatch.discovery.sampler import Crowd, split_by_kind
 from mlbatch.discovery.types import DetectedSensor
 from mlbatch.errors import MlbatchError, RecordingError
 from mlbatch.lidar.content_keys import content_keys

@@ -9,9 +9,8 @@ import numpy as np
 
 from mlbatch.arrays import BoolArray, I64Array, U8Array
 from mlbatch.batching.intake import Accepted, Arrival, Intake, Payloads
-from mlbatch.discovery.crowd import Crowd
 from mlbatch.discovery.router import Role, Router
-from mlbatch.discovery.sampler import SAMPLES_PER_KIND, split_by_kind
+from mlbatch.discovery.sampler import SAMPLES_PER_KIND, Crowd, split_by_kind
 from mlbatch.discovery.types import PacketKind
 from mlbatch.lidar.headers import Headers
 from mlbatch.lidar.interface import Lidar

@@ -14,7 +14,6 @@ from mlbatch.clocks.compare import SYNCHRONISED, Comparison, compare
 from mlbatch.clocks.host_offset import HostOffset, describe_off
 from mlbatch.clocks.timescale import format_difference, timescale
 from mlbatch.clocks.watch import ClockEstimate
-from mlbatch.discovery.crowd import MOST_KINDS
 from mlbatch.discovery.discover import (
     Discovery,
     SensorSelection,
@@ -23,12 +22,12 @@ from mlbatch.discovery.discover import (
     name_kind,
     packet_types,
 )
+from mlbatch.discovery.first_seconds import is_without_packets
 from mlbatch.discovery.interleaved import shared_address
 from mlbatch.discovery.match import describe, describe_each
 from mlbatch.discovery.overlap import SharedLidars, iso
-from mlbatch.discovery.probe import first_seconds, is_without_packets
 from mlbatch.discovery.router import Role
-from mlbatch.discovery.sampler import split_by_kind
+from mlbatch.discovery.sampler import MOST_KINDS, split_by_kind
 from mlbatch.discovery.types import DetectedSensor, PacketKind
 from mlbatch.errors import RecordingError, RigError
 from mlbatch.native.arena import PacketArena
@@ -41,7 +40,7 @@ from mlbatch.pipeline.contents import (
 from mlbatch.pipeline.ingest import Ingest
 from mlbatch.pipeline.job import Job
 from mlbatch.pipeline.session import sensors_of
-from mlbatch.readers import merge, open_recordings
+from mlbatch.readers import open_recordings
 from mlbatch.readers.bag.clouds import CloudRecording
 from mlbatch.rig.rig import (
     DEFAULT_BODY_FRAME,
@@ -525,8 +524,8 @@ def _measure(
                 if kind in sensor.kinds:
                     shared.add(recording, sensor, batch, index)
 
-    read = merge if whole else first_seconds
-    for batch in read(recordings, is_without_packets, compare):
+    read = discovery.first.whole if whole else discovery.first.again
+    for batch in read(is_without_packets, compare):
         topics.add(batch.messages)
         if progress is not None:
             progress(sum(recording.position_bytes for recording in recordings), size_bytes)

@@ -8,12 +8,11 @@ import numpy as np
 
 from mlbatch import sensors
 from mlbatch.arrays import U8Array
-from mlbatch.discovery.crowd import Crowd
 from mlbatch.discovery.discover import Discovery
+from mlbatch.discovery.first_seconds import FIRST_NS
 from mlbatch.discovery.overlap import LidarSpan, SharedLidars, lidar_name, problem
-from mlbatch.discovery.probe import PROBE_NS
 from mlbatch.discovery.router import Role
-from mlbatch.discovery.sampler import SAMPLES_PER_KIND, split_by_kind
+from mlbatch.discovery.sampler import SAMPLES_PER_KIND, Crowd, split_by_kind
 from mlbatch.discovery.types import PacketKind
 from mlbatch.errors import RecordingError
 from mlbatch.types import PacketBatch, Recording
@@ -61,7 +60,7 @@ class RunOverlap:
         elif (
             not self._is_settled
             and self._begun_ns is not None
-            and newest_ns - self._begun_ns > PROBE_NS
+            and newest_ns - self._begun_ns > FIRST_NS
             and all(one.first_ns is not None or one.is_whole for one in self._spans.values())
         ):
             self._is_settled = True

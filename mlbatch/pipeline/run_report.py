@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING
 from mlbatch.arrays import U8Array
 from mlbatch.clocks.host_offset import HostOffset, describe_off
 from mlbatch.clocks.timescale import describe_time
-from mlbatch.discovery.crowd import MOST_KINDS
 from mlbatch.discovery.discover import not_in_rig
 from mlbatch.discovery.match import describe, describe_each
+from mlbatch.discovery.sampler import MOST_KINDS
 from mlbatch.discovery.types import Note, PacketKind
 from mlbatch.pipeline.passthrough import PASS_REASONS
 from mlbatch.pipeline.point_notes import point_notes

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from mlbatch.arrays import BoolArray
-from mlbatch.discovery.probe import is_metadata
+from mlbatch.discovery.calibrations import is_metadata
 from mlbatch.types import Message, PacketBatch, Recording, WrappedRecording
 
 

@@ -11,8 +11,8 @@ import numpy as np
 
 from mlbatch.arrays import BoolArray, F64Array, U8Array
 from mlbatch.discovery.discover import Discovery, discover, refuse_absent, refuse_untimed
+from mlbatch.discovery.first_seconds import is_without_packets
 from mlbatch.discovery.match import release
-from mlbatch.discovery.probe import is_without_packets
 from mlbatch.discovery.sampler import clock_watch
 from mlbatch.discovery.types import Note, PacketKind
 from mlbatch.errors import RecordingError
@@ -23,7 +23,7 @@ from mlbatch.pipeline.ingest import Ingest
 from mlbatch.pipeline.job import Job
 from mlbatch.pipeline.segments import ClippedRecording, TimeSegment
 from mlbatch.pipeline.sensor import Limits, Sensor, SensorClock, new_ring
-from mlbatch.readers import merge, open_recordings
+from mlbatch.readers import open_recordings
 from mlbatch.readers.source import BUFFER_BYTES
 from mlbatch.report.limits import ACCEPTED
 from mlbatch.rig.rig import Rig, RigSensor
@@ -81,7 +81,7 @@ class Session:
         self.replay = self._replay()
         self.clocks = ClockMonitor(self.sensors, self.replay)
         if job.align_clocks_to:
-            batches = self._shown(merge(self.recordings), progress)
+            batches = self._shown(self.setup.first.whole(), progress)
             self.clocks.align(batches, self.setup.router, job.align_clocks_to)
         maps_stamps = bool(job.faults or job.align_clocks_to)
         self.ingest = Ingest(
@@ -136,10 +136,10 @@ class Session:
             from mlbatch.pipeline.overlap import RunOverlap
 
             self._overlap = RunOverlap(self.recordings, self.setup)
-        elif self._reads_into_arena and self.replay is None:
+        elif self._reads_into_arena and self.replay is None and not self.setup.first.has_all:
             self.recordings[0].use_arena(self._arena)
         seen = None if self._overlap is None else self._overlap.add
-        with contextlib.closing(merge(self.recordings, is_without_packets, seen)) as merged:
+        with contextlib.closing(self.setup.first.whole(is_without_packets, seen)) as merged:
             batches: Iterator[PacketBatch] = merged
             if self.replay is not None:
                 batches = self.replay.batches(batches, self.ingest.owners)

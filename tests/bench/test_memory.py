@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from mlbatch.discovery.crowd import MOST_KINDS
+from mlbatch.discovery.sampler import MOST_KINDS
 from tests.builders.bags import Body, Recorded
 from tests.builders.captures import udp_frame
 from tests.builders.sessions import NS_PER_S, REPOSITORY, Unit, write_session

@@ -14,8 +14,8 @@ import yaml
 
 from mlbatch import writers
 from mlbatch.discovery import sampler
+from mlbatch.discovery.calibrations import MAX_CALIBRATION_FILE_BYTES
 from mlbatch.discovery.discover import SensorSelection
-from mlbatch.discovery.probe import MAX_CALIBRATION_FILE_BYTES
 from mlbatch.frames import urdf
 from mlbatch.lidar import limits as lidar_limits
 from mlbatch.page.findings import REMEDIES

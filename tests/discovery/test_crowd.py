@@ -11,9 +11,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mlbatch.discovery import crowd
-from mlbatch.discovery.crowd import EXAMINED_AT, MOST_KINDS, Crowd
-from mlbatch.discovery.sampler import split_by_kind
+from mlbatch.discovery import sampler
+from mlbatch.discovery.sampler import EXAMINED_AT, MOST_KINDS, Crowd, split_by_kind
 from mlbatch.discovery.types import PacketKind
 from mlbatch.types import MOST_STREAMS, OTHER_STREAMS, PacketBatch, Stream, StreamTable
 from tests.builders.captures import udp_frame, write_pcap
@@ -57,8 +56,8 @@ def test_what_is_followed_does_not_depend_on_batches(
     found: set[int] = set()
     tested = Crowd()
     with (
-        patch.object(crowd, "MOST_KINDS", most),
-        patch.object(crowd, "_is_recognised", is_recognised),
+        patch.object(sampler, "MOST_KINDS", most),
+        patch.object(sampler, "_is_recognised", is_recognised),
     ):
         bounds = sorted({0, len(streams), *(cut for cut in cuts if cut < len(streams))})
         for begin, end in itertools.pairwise(bounds):

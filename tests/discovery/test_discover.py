@@ -8,9 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from mlbatch.discovery.calibrations import find_calibrations
 from mlbatch.discovery.discover import Discovery, SensorSelection, discover
+from mlbatch.discovery.first_seconds import FirstSeconds, is_without_packets
 from mlbatch.discovery.match import describe
-from mlbatch.discovery.probe import find_calibrations, first_seconds, probe
 from mlbatch.errors import RecordingError, RigError, UsageError
 from mlbatch.readers import open_recording
 from mlbatch.types import StreamTable
@@ -39,10 +40,12 @@ def test_the_first_seconds_are_ten(tmp_path: Path) -> None:
     captures = [write_session(tmp_path / "1", one), write_session(tmp_path / "2", late)]
     table = StreamTable()
     recordings = [open_recording(path, table) for path in captures]
-    host_ns = np.concatenate([batch.host_ns for batch in first_seconds(recordings)])
+    first = FirstSeconds(recordings, table)
+    read = first.again(is_without_packets, None)
+    host_ns = np.concatenate([batch.host_ns for batch in read])
     assert host_ns[-1] - host_ns[0] <= 10 * NS_PER_S
     # 32 packets a revolution of 0.1 s: 6 s of the first; of the second 5 s and the packet at 10 s.
-    sampler, _ = probe(recordings, table)
+    sampler = first.sampler
     assert [samples.packets for samples in sampler.kinds.values()] == [60 * 32, 50 * 32 + 1]
 
 
@@ -132,7 +135,7 @@ def test_unknown_packets_are_described(tmp_path: Path) -> None:
     one = Unit()
     capture = write_session(tmp_path, one, more=one.imu_records(2), metadata=False)
     table = StreamTable()
-    sampler, _ = probe([open_recording(capture, table)], table)
+    sampler = FirstSeconds([open_recording(capture, table)], table).sampler
     words = {kind.size: describe(sampler, kind) for kind in sampler.kinds}
     assert words == {
         1280: "Ouster lidar, serial 111, 1280 bytes: needs its metadata",

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from mlbatch.discovery.probe import probe, with_clouds
+from mlbatch.discovery.first_seconds import FirstSeconds, with_clouds
 from mlbatch.frames.naming import Candidate
 from mlbatch.readers.bag.packet_messages import PACKET_TYPES
 from mlbatch.readers.bag.recording import BagRecording, Portion
@@ -144,7 +144,8 @@ def _read(data: bytes, folder: Path) -> None:
 
     bag = BagRecording(folder, "bag", 0, table, portions, topics=(topic,))
     recordings, _ = with_clouds([bag], table, None, ())
-    sampler, collector = probe(recordings, table)
+    first = FirstSeconds(recordings, table)
+    sampler, collector = first.sampler, first.metadata
     for recording in recordings:
         for batch in recording.packets():
             check_batch(batch, table)

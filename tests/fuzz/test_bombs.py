@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 import zstandard
 
-from mlbatch.discovery.probe import find_calibrations, read_given
+from mlbatch.discovery.calibrations import find_calibrations, read_given
 from mlbatch.errors import MlbatchError, RigError
 from mlbatch.readers import open_recording
 from mlbatch.rig.rig import read_rig

@@ -16,8 +16,9 @@ import pytest
 from mlbatch.batching.intake import NEVER, extremes
 from mlbatch.clocks.compare import SYNCHRONISED, UNSYNCHRONISED, compare
 from mlbatch.clocks.watch import ClockEstimate, ClockWatch
+from mlbatch.discovery.calibrations import find_calibrations
+from mlbatch.discovery.first_seconds import FirstSeconds
 from mlbatch.discovery.match import match
-from mlbatch.discovery.probe import find_calibrations, probe
 from mlbatch.discovery.sampler import split_by_kind
 from mlbatch.readers import merge, open_recording
 from mlbatch.types import StreamTable
@@ -103,9 +104,9 @@ def estimates(path: Path, period_ns: int = 0) -> dict[str, ClockEstimate]:
         (path,) = path.glob("*.db3")
     table = StreamTable()
     recordings = [open_recording(path, table)]
-    sampler, collector = probe(recordings, table)
+    first = FirstSeconds(recordings, table)
     calibrations, _ = find_calibrations([path], ())
-    sensors = match(sampler, [*calibrations, *collector.calibrations()], {}).sensors
+    sensors = match(first.sampler, [*calibrations, *first.metadata.calibrations()], {}).sensors
     watches = {sensor.name: ClockWatch(period_ns=period_ns) for sensor in sensors}
     for batch in merge(recordings):
         for kind, index in split_by_kind(batch):

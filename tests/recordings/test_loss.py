@@ -12,8 +12,9 @@ from functools import lru_cache
 import numpy as np
 import pytest
 
+from mlbatch.discovery.calibrations import find_calibrations
+from mlbatch.discovery.first_seconds import FirstSeconds
 from mlbatch.discovery.match import match
-from mlbatch.discovery.probe import find_calibrations, probe
 from mlbatch.discovery.sampler import split_by_kind
 from mlbatch.readers import merge, open_recording
 from mlbatch.types import ColumnHeaders, StreamTable
@@ -41,9 +42,9 @@ def _read(vendor: str, path: str) -> Came:
         (place,) = place.glob("*.db3")
     table = StreamTable()
     recordings = [open_recording(place, table)]
-    sampler, collector = probe(recordings, table)
+    first = FirstSeconds(recordings, table)
     calibrations, _ = find_calibrations([place], ())
-    (sensor,) = match(sampler, [*calibrations, *collector.calibrations()], {}).sensors
+    (sensor,) = match(first.sampler, [*calibrations, *first.metadata.calibrations()], {}).sensors
     lidar, payloads, hosts = sensor.lidar, [], []
     for batch in merge(recordings):
         for kind, index in split_by_kind(batch):

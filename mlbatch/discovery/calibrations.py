@@ -1,42 +1,26 @@
-"""The first seconds of a session, and the calibrations in and around its recordings.
+"""The calibrations in and around the recordings of a session.
 
 Sources: docs/sources/messages.md sections 2 (calibrations) and 6 (transforms).
 """
 
 from __future__ import annotations
 
-import contextlib
-import difflib
 import re
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeAlias
-
-import numpy as np
+from typing import TYPE_CHECKING
 
 from mlbatch import readers, ros, sensors
-from mlbatch.discovery.crowd import Crowd
 from mlbatch.discovery.extrinsics import ExtrinsicsSources
-from mlbatch.discovery.sampler import Sampler, split_by_kind
 from mlbatch.errors import MlbatchError, RigError
 from mlbatch.frames.naming import nearest_topic
 from mlbatch.lidar.interface import Calibration, Evidence, Lidar
-from mlbatch.readers import has_packets, merge
 from mlbatch.readers.datasets import BAG_METADATA
-from mlbatch.readers.merge import Seen
-from mlbatch.rig.rig import Rig, RigSensor
-from mlbatch.types import Message, PacketBatch, Recording, StreamTable, Topic
-from mlbatch.units import NS_PER_S
+from mlbatch.types import Message, PacketBatch, Recording, Topic
 
 if TYPE_CHECKING:
-    from mlbatch.readers.bag.cloud_topics import CloudTopics
+    pass
 
-ByLogTime: TypeAlias = Callable[[Recording], bool]
-# Length of the part that is probed.
-PROBE_NS = 10 * NS_PER_S
-# Packets of a kind in a batch that are checked for being a lidar's.
-_CHECKED = 16
 # Suffixes of calibration files in the recording's directory; vendors recognise them by content.
 CALIBRATION_SUFFIXES = (".csv", ".dat", ".json", ".xml", ".yaml", ".yml")
 METADATA_SUFFIX = ".json"
@@ -57,137 +41,6 @@ STATIC = "tf_static"
 CORRECTIONS = "lidar_corrections"
 # Added to scores: a calibration recorded with the packets is preferred to a file.
 _RECORDED_SCORE = 10_000
-
-
-# -- recordings -----------------------------------------------------------------------------------
-
-
-def with_clouds(
-    recordings: Sequence[Recording], table: StreamTable, rig: Rig | None, ignore: Collection[str]
-) -> tuple[list[Recording], CloudTopics | None]:
-    """The recordings, with decoded clouds as packets; and these clouds.
-
-    All clouds, if the session contains no raw packets: those of lidars that the rig lacks are then
-    counted as unassigned. Else those on topics in the rig, since the others may be made from the
-    packets. ignore: topics to leave out.
-    """
-    recorded = [topic for recording in recordings for topic in recording.topics]
-    if not recorded:
-        return list(recordings), None
-    # Not loaded for captures.
-    from mlbatch.readers.bag.cloud_topics import CloudTopics, cloud_topics
-    from mlbatch.readers.bag.clouds import CloudRecording
-
-    sensors = () if rig is None else rig.sensors
-    topics = {one.stream.topic for one in sensors if one.stream is not None} - {""}
-    clouds = {topic.name: topic for topic in cloud_topics(recorded)}
-    # A capture has no topics, only packets.
-    has_captures = any(not recording.topics for recording in recordings)
-    is_raw = has_captures or any(map(has_packets, recorded))
-    chosen = [cloud for name, cloud in clouds.items() if name in topics or not is_raw]
-    _refuse_points_of_packets(sensors, clouds)
-    chosen = [topic for topic in chosen if topic.name not in ignore]
-    if not chosen:
-        return list(recordings), None
-    found = CloudTopics(tuple(chosen), tuple(sensors))
-    found.examine(recordings)
-    if topics:
-        found.leave_out_copies(topics)
-    if not found.topics:
-        return list(recordings), found
-    return [CloudRecording(recording, table, found) for recording in recordings], found
-
-
-def _refuse_points_of_packets(sensors: Sequence[RigSensor], clouds: Collection[str]) -> None:
-    """Raise RigError for `points` of a sensor whose topic has no clouds."""
-    for sensor in sensors:
-        if sensor.points is None or sensor.stream is None or sensor.stream.topic in clouds:
-            continue
-        place = next(iter(sensor.points.places.values()), f"sensor {sensor.name}")
-        near = difflib.get_close_matches(sensor.stream.topic, list(clouds), n=1, cutoff=0.0)
-        remedy = f"the nearest topic of clouds is {near[0]}" if near else "remove points"
-        raise RigError(
-            f"{place}: expected decoded clouds on {sensor.stream.topic}, found none; {remedy}"
-        )
-
-
-def is_without_packets(recording: Recording) -> bool:
-    """True if a recording has no packet topics, only messages."""
-    if not recording.topics or any(map(has_packets, recording.topics)):
-        return False
-    # Not loaded for captures.
-    from mlbatch.readers.bag.clouds import CloudRecording
-
-    clouds = recording.clouds.topics if isinstance(recording, CloudRecording) else ()
-    return not {topic.name for topic in clouds} & {topic.name for topic in recording.topics}
-
-
-def probe(
-    recordings: Sequence[Recording], table: StreamTable, cut: CloudTopics | None = None
-) -> tuple[Sampler, MetadataCollector]:
-    """Read the first 10 s of a session: samples of its packets, and its metadata messages.
-
-    cut: clouds of which the first points are enough; counts of their packets are then too small.
-    """
-    sampler = Sampler(table)
-    collector = MetadataCollector()
-    subscribe(recordings)
-    if cut is not None:
-        cut.first_points_only = True
-    try:
-        for batch in first_seconds(recordings):
-            sampler.add(batch)
-            collector.add(batch)
-    finally:
-        if cut is not None:
-            cut.first_points_only = False
-    for recording in recordings:
-        recording.keep = frozenset()
-    return sampler, collector
-
-
-def first_seconds(
-    recordings: Sequence[Recording],
-    by_log_time: ByLogTime | None = None,
-    seen: Seen | None = None,
-) -> Iterator[PacketBatch]:
-    """Yield all packets up to 10 s after the first lidar packet.
-
-    by_log_time, seen: as for `merge`.
-
-    A capture may start long before the lidars do. The end does not depend on the size of batches.
-    """
-    end_ns: int | None = None
-    crowd = Crowd()
-    merged = merge(recordings) if by_log_time is None else merge(recordings, by_log_time, seen)
-    with contextlib.closing(merged) as batches:
-        for batch in batches:
-            if end_ns is None:
-                begin_ns = _first_lidar_host_ns(batch, crowd)
-                end_ns = None if begin_ns is None else begin_ns + PROBE_NS
-            if end_ns is None:
-                yield batch
-                continue
-            later = np.flatnonzero(batch.host_ns > end_ns)
-            if len(later):
-                yield replace(batch.take(slice(0, int(later[0]))), messages=batch.messages)
-                return
-            yield batch
-
-
-def _first_lidar_host_ns(batch: PacketBatch, crowd: Crowd) -> int | None:
-    """Receive time of the first packet of a kind that is described as a lidar's.
-
-    Several packets are checked: device packets may come first on the same topic.
-    """
-    begins_ns = []
-    for kind, index in crowd.followed(batch, split_by_kind(batch)):
-        begins = batch.start[index[:_CHECKED]].tolist()
-        checked = np.stack([batch.data[begin : begin + kind.size] for begin in begins])
-        text = sensors.describe(kind.size, checked)
-        if text is not None and "lidar" in text:
-            begins_ns.append(int(batch.host_ns[index[0]]))
-    return min(begins_ns, default=None)
 
 
 # -- calibration files ----------------------------------------------------------------------------
