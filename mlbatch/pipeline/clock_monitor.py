@@ -10,7 +10,6 @@ from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING
 
 from mlbatch.arrays import I64Array
-from mlbatch.batching.intake import Intake
 from mlbatch.clocks.compare import Comparison, compare
 from mlbatch.clocks.watch import ClockEstimate
 from mlbatch.discovery.router import Router
@@ -56,8 +55,7 @@ class ClockMonitor:
         sensors = [sensor.unread(arena) for sensor in self._sensors]
         watches = [clock_watch(sensor.lidar) for sensor in sensors]
         intakes = [
-            Intake(sensor.name, sensor.column_offsets, takes_all=True, watch=watch)
-            for sensor, watch in zip(sensors, watches, strict=True)
+            sensor.clock_intake(watch) for sensor, watch in zip(sensors, watches, strict=True)
         ]
         ingest = Ingest(router, sensors, intakes, self.map_stamps)
         if self._replay is not None:

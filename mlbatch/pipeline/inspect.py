@@ -9,7 +9,6 @@ from pathlib import Path
 import numpy as np
 
 from mlbatch.arrays import F64Array
-from mlbatch.batching.intake import NEVER, extremes
 from mlbatch.clocks.compare import SYNCHRONISED, Comparison, compare
 from mlbatch.clocks.host_offset import HostOffset, describe_off
 from mlbatch.clocks.timescale import format_difference, timescale
@@ -430,40 +429,35 @@ def _notes(discovery: Discovery) -> Iterator[str]:
 class _Measured:
     """Packets of the sensors as a run takes them: their loss, clocks, and those of no sensor.
 
-    loss: packets lost of each sensor; first: first timestamp and receive time of each, ns.
+    sent: of each sensor, kinds with a packet of it; one that begins late may be of another.
     """
 
     def __init__(self, discovery: Discovery) -> None:
         self._arena = PacketArena()
         self._sensors = sensors_of(discovery, Job(()), self._arena)
-        self._ingest = Ingest(discovery.router, self._sensors)
-        # Steps of a clock are shown, not refused: then only receive times continue.
-        self._intakes = [sensor.intake(host_clock=True) for sensor in self._sensors]
         self._firsts: list[tuple[int, int] | None] = [None for _ in self._sensors]
-        # Of each sensor, kinds with a packet of it; one that begins late may be of another.
         self.sent: list[set[PacketKind]] = [set() for _ in self._sensors]
+        # Steps of a clock are shown, not refused: loss is counted as with `--clock host`, and
+        # clocks are watched before anything is rejected, as for `--align-clocks`.
+        self._intakes = [sensor.intake(host_clock=True) for sensor in self._sensors]
+        self._losses = Ingest(discovery.router, self._sensors, self._intakes)
+        shown = [sensor.unread(self._arena) for sensor in self._sensors]
+        self._ingest = Ingest(discovery.router, shown, [sensor.clock_intake() for sensor in shown])
 
     def add(self, batch: PacketBatch) -> None:
         """Add all packets of a batch."""
         self._arena.keep_from(None)
-        for number, arrival in enumerate(self._ingest.columns(batch).arrivals):
-            if arrival is None or not len(arrival.host_ns):
+        self._losses.columns(batch)
+        for number, accepted in enumerate(self._ingest.columns(batch).accepted):
+            if accepted is None or not len(accepted.host_ns):
                 continue
-            sensor = self._sensors[number]
-            headers = arrival.headers
-            at = arrival.position
-            self.sent[number].update(kind for kind, _ in split_by_kind(batch.take(at)))
-            if sensor.clock.has_receive_times:
-                _, newest_ns = extremes(headers)
-                known = newest_ns > NEVER
-                sensor.clock.watch.add(newest_ns[known], arrival.host_ns[known])
-            if self._firsts[number] is None and headers.valid.any():
-                row, column = np.argwhere(headers.valid)[0]
-                self._firsts[number] = (
-                    int(headers.stamp_ns[row, column]),
-                    int(arrival.host_ns[row]),
-                )
-            self._intakes[number].accept(arrival)
+            kinds = split_by_kind(batch.take(accepted.position))
+            self.sent[number].update(kind for kind, _ in kinds)
+            valid = accepted.columns.valid
+            if self._firsts[number] is None and valid.any():
+                row, column = np.argwhere(valid)[0]
+                stamp_ns = int(accepted.columns.stamp_ns[row, column])
+                self._firsts[number] = stamp_ns, int(accepted.host_ns[row])
 
     def lost(self, number: int) -> int:
         """Lost packets of a sensor."""

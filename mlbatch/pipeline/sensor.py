@@ -110,23 +110,32 @@ class Sensor:
         """Ring indexes of the columns of a packet, relative to that of the packet: (C,)."""
         return self.ring.column_offsets(self.lidar.columns_per_packet)
 
-    def intake(self) -> Intake:
-        """A new intake of the batcher for this sensor."""
+    def intake(self, *, host_clock: bool = False) -> Intake:
+        """A new intake of the batcher for this sensor; host_clock: whatever its clock is."""
         lidar = self.lidar
-        watches = self.clock.has_receive_times and not self.clock.by_host
+        by_host = host_clock or self.clock.by_host
+        watches = self.clock.has_receive_times and not by_host
         return Intake(
             self.name,
             self.column_offsets,
             lidar.reader,
-            host_clock=self.clock.by_host,
+            host_clock=by_host,
             offset_ns=self.clock.offset_ns,
             modulus=lidar.sequence_modulus,
             packet_ns=lidar.columns_per_packet * lidar.column_period_ns,
             has_receive_times=self.clock.has_receive_times,
             # Receive times show nothing of a sensor's clock.
-            finds_jumps=not self.clock.by_host,
+            finds_jumps=not by_host,
             # Delays cannot be measured where packets share the log time of a message.
             watch=self.clock.watch if watches else None,
+        )
+
+    def clock_intake(self, watch: ClockWatch | None = None) -> Intake:
+        """A new intake for a pass that only watches the clock, that of the run or another."""
+        if watch is None and self.clock.has_receive_times:
+            watch = self.clock.watch
+        return Intake(
+            self.name, self.column_offsets, self.lidar.reader, takes_all=True, watch=watch
         )
 
     def pace(self) -> Pace:
