@@ -35,8 +35,8 @@ def run_files(output: Path) -> RunFiles:
 
 
 def _inside(output: Path) -> tuple[str, str]:
-    from mlbatch.verify.mcap_file import McapFile
-    from mlbatch.verify.verdict import CheckLog
+    from mlbatch.outputs.damage import CheckLog
+    from mlbatch.outputs.mcap_file import McapFile
 
     if not output.is_file() or not output.name.endswith(".mcap"):
         return "", ""

@@ -1,7 +1,6 @@
 """`mlbatch.read`: the scans of an output, one after another, whatever its format.
 
-Records and messages are parsed by the readers of `verify`; anything that they report as damaged
-is an error here.
+Anything that the readers of a format report as damaged is an error here.
 """
 
 from __future__ import annotations
@@ -16,22 +15,22 @@ import numpy as np
 from mlbatch.bounded import open_file, parse_json
 from mlbatch.errors import RecordingError
 from mlbatch.outputs.clouds import CloudPlace, Values, scan_of_cloud, scan_of_fields
+from mlbatch.outputs.commented import CommentedReader
+from mlbatch.outputs.damage import CheckLog, DamageError, VerifyError
+from mlbatch.outputs.float_rows import KITTI_SUFFIX, NUSCENES_SUFFIX, read_rows, start_of
+from mlbatch.outputs.folders import ScanFile, entries, refuse_shard, scan_files
+from mlbatch.outputs.las import LasReader
+from mlbatch.outputs.npz import arrays_of
+from mlbatch.outputs.pcd import PcdReader
+from mlbatch.outputs.ply import PlyReader
 from mlbatch.outputs.run_files import RunFiles, RunOfOutput, row_of, variants_of
 from mlbatch.outputs.scan import Scan
 from mlbatch.outputs.table import ScanRow, TableOfRun
 from mlbatch.types import RunInfo
-from mlbatch.verify.commented import CommentedReader
-from mlbatch.verify.float_rows import KITTI_SUFFIX, NUSCENES_SUFFIX, read_rows, start_of
-from mlbatch.verify.folders import ScanFile, entries, refuse_shard, scan_files
-from mlbatch.verify.las import LasReader
-from mlbatch.verify.npz import arrays_of
-from mlbatch.verify.pcd import PcdReader
-from mlbatch.verify.ply import PlyReader
-from mlbatch.verify.verdict import CheckLog, DamageError, VerifyError
 from mlbatch.writers.atomic import PARTIAL_SUFFIX
 
 if TYPE_CHECKING:
-    from mlbatch.verify.mcap_file import McapFile
+    from mlbatch.outputs.mcap_file import McapFile
 
 _METADATA = "metadata.yaml"
 _MCAP_MAGIC = b"\x89MCAP0\r\n"
@@ -94,7 +93,7 @@ def _scans_of_folder(path: Path) -> Iterator[Scan]:
     refuse_shard(path)
     inside = entries(path)
     if any(entry.name == _METADATA for entry in inside):
-        from mlbatch.verify.rosbag2 import open_bag
+        from mlbatch.outputs.rosbag2 import open_bag
 
         log = CheckLog()
         bag, _ = open_bag(log, path)
@@ -113,7 +112,7 @@ def _scans_of_folder(path: Path) -> Iterator[Scan]:
 
 
 def _refuse_damage(log: CheckLog, path: Path) -> None:
-    """Raise RecordingError for what a reader of `verify` has found."""
+    """Raise RecordingError for what a reader of a format has found."""
     for violation in log.violations:
         raise RecordingError(
             f"{path}: {violation.where}: expected {violation.expected}, found {violation.found}; "
@@ -126,7 +125,7 @@ def _refuse_damage(log: CheckLog, path: Path) -> None:
 
 def _scans_of_mcap(output: Path, paths: Mapping[str, Path]) -> Iterator[Scan]:
     """The scans of an output of MCAP files; paths: of all, by their names for errors."""
-    from mlbatch.verify.mcap_file import McapFile
+    from mlbatch.outputs.mcap_file import McapFile
 
     log = CheckLog()
     clouds: _Clouds | None = None
@@ -176,7 +175,7 @@ def _run_of_mcap(output: Path, path: Path, file: McapFile) -> RunOfOutput:
 
 
 def _scans_of_bag(path: Path) -> Iterator[Scan]:
-    from mlbatch.verify.rosbag1 import BagFile
+    from mlbatch.outputs.rosbag1 import BagFile
 
     log = CheckLog()
     clouds = _Clouds(RunFiles.of(path).about())
@@ -200,8 +199,8 @@ class _Clouds:
 
     def scan(self, topic: str, data: bytes | memoryview, encoding: str) -> Iterator[Scan]:
         """The scan of a message; none for a forwarded topic."""
-        from mlbatch.verify.encoding import MessageCursor
-        from mlbatch.verify.messages import read_cloud
+        from mlbatch.outputs.cloud_messages import read_cloud
+        from mlbatch.outputs.encoding import MessageCursor
 
         own = {"/points": None} | {
             f"/{name}/points": number for number, name in enumerate(self._about.sensors)

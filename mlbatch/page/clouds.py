@@ -10,15 +10,15 @@ import numpy as np
 
 from mlbatch.arrays import BoolArray, F32Array, F64Array, U8Array, U16Array
 from mlbatch.bounded import open_file
+from mlbatch.outputs.cloud_messages import CLOUD, read_cloud, stored_scan
+from mlbatch.outputs.containers import BoundedFile, Message, library_errors
+from mlbatch.outputs.damage import CheckLog, DamageError, VerifyError
+from mlbatch.outputs.encoding import MessageCursor
+from mlbatch.outputs.file_formats import FILE_FORMATS
+from mlbatch.outputs.folders import entries, scan_files
+from mlbatch.outputs.stored_scan import StoredScan
 from mlbatch.page.windows import Windows
 from mlbatch.units import NS_PER_S
-from mlbatch.verify.containers import BoundedFile, Message, library_errors
-from mlbatch.verify.encoding import MessageCursor
-from mlbatch.verify.file_formats import FILE_FORMATS
-from mlbatch.verify.folders import entries, scan_files
-from mlbatch.verify.messages import CLOUD, read_cloud, stored_scan
-from mlbatch.verify.scan import StoredScan
-from mlbatch.verify.verdict import CheckLog, DamageError, VerifyError
 
 # Points of all scans on a page: 9 bytes each, 12 in base64.
 MOST_POINTS = 54_000
@@ -168,7 +168,7 @@ def _mcap_messages(file: Path, places: list[Place], topics: list[str]) -> Iterat
     from mcap.records import Message as Record
     from mcap.stream_reader import breakup_chunk
 
-    from mlbatch.verify.mcap_file import unpacked
+    from mlbatch.outputs.mcap_file import unpacked
 
     starts = {place.start_ns for place in places}
     with library_errors("an MCAP file with an index"), BoundedFile(file) as stream:

@@ -21,12 +21,12 @@ import numpy.typing as npt
 
 from mlbatch.arrays import F64Array
 from mlbatch.clocks.timescale import describe_time
+from mlbatch.outputs.damage import VerifyError
 from mlbatch.page.clouds import PageCloud, choose_places, read_clouds, window_ms
 from mlbatch.page.findings import Finding, Level, findings, number, percent, verdict
 from mlbatch.page.source import Source
 from mlbatch.page.values import Values
 from mlbatch.page.windows import Windows, read_windows, summarise
-from mlbatch.verify.verdict import VerifyError
 
 _WORDS = {
     Level.GOOD: ("good", "OK"),

@@ -7,8 +7,8 @@ from pathlib import Path
 
 from mlbatch.bounded import open_file, parse_json
 from mlbatch.errors import ExportError, RecordingError
+from mlbatch.outputs.folders import refuse_shard
 from mlbatch.page.values import Values
-from mlbatch.verify.folders import refuse_shard
 from mlbatch.verify.report_checks import REPORT, SCHEMA, TABLE, ReportPlaces
 
 _REPORT_SUFFIX = f".{REPORT}"
@@ -143,8 +143,8 @@ def _inside(path: Path) -> tuple[str | None, str | None]:
         return None, None
     from mcap.reader import make_reader
 
-    from mlbatch.verify.containers import BoundedFile, library_errors
-    from mlbatch.verify.verdict import DamageError
+    from mlbatch.outputs.containers import BoundedFile, library_errors
+    from mlbatch.outputs.damage import DamageError
 
     report = None
     table = None

@@ -253,8 +253,8 @@ _NO_POSES = PoseTrack(np.zeros(0, np.int64), np.zeros((0, 3, 3)), np.zeros((0, 3
 
 def _sample_of(message: Message) -> tuple[str, _Samples] | None:
     """Frame and sample of a sensor_msgs/Imu; None for a damaged one."""
-    from mlbatch.verify.encoding import MessageCursor
-    from mlbatch.verify.verdict import DamageError
+    from mlbatch.outputs.damage import DamageError
+    from mlbatch.outputs.encoding import MessageCursor
 
     try:
         cursor = MessageCursor.of_message(message.data, message.topic.encoding)

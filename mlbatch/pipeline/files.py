@@ -225,7 +225,7 @@ def missing(target: Path, job: Job, name: str, options: WriterOptions) -> list[s
     else:
         expected = {SCANS_CSV, METADATA}
         if METADATA in present:
-            from mlbatch.verify.rosbag2 import listed_files
+            from mlbatch.outputs.rosbag2 import listed_files
 
             expected |= set(listed_files(target))
     return sorted(expected - present)

@@ -1,7 +1,8 @@
 """Checks of an output from the output alone: `verify(path)` gives a `Verdict`.
 
-Grid, formats and point layouts are defined a second time: only types are shared with the writers,
-so that a fault of the writers is not hidden by the same fault here.
+The readers of `outputs` report what is damaged, the checks here judge the rest. They define grid,
+formats and point layouts a second time: only types are shared with the writers, so that a fault of
+the writers is not hidden by the same fault here.
 """
 
 from __future__ import annotations
@@ -11,17 +12,11 @@ from os import PathLike
 from pathlib import Path
 from types import ModuleType
 
+from mlbatch.outputs.damage import CheckLog, VerifyError, Violation
 from mlbatch.verify.examination import Progress
 from mlbatch.verify.outputs import Output, check_output
 from mlbatch.verify.report_checks import ReportPlaces
-from mlbatch.verify.verdict import (
-    CHECKS,
-    Check,
-    CheckLog,
-    Verdict,
-    VerifyError,
-    Violation,
-)
+from mlbatch.verify.verdict import CHECKS, Check, Verdict
 
 __all__ = ["CHECKS", "Check", "Verdict", "VerifyError", "Violation", "verify"]
 

@@ -7,15 +7,17 @@ from dataclasses import replace
 from itertools import pairwise
 from typing import NamedTuple
 
+from mlbatch.outputs.damage import CheckLog
+from mlbatch.outputs.metadata import RunMetadata
+from mlbatch.outputs.stored_scan import StoredScan
 from mlbatch.verify.report_checks import (
     ReportFiles,
-    RunMetadata,
     check_ledgers,
     check_period,
     check_report,
+    grid_of,
     poses_of,
 )
-from mlbatch.verify.scan import StoredScan
 from mlbatch.verify.scan_checks import (
     DuplicateColumns,
     GeometryChecks,
@@ -27,7 +29,6 @@ from mlbatch.verify.scan_checks import (
     valid_points,
 )
 from mlbatch.verify.table import OutputTotals, Table, check_table
-from mlbatch.verify.verdict import CheckLog
 
 # Called with the number of scans checked, and of all scans (0: unknown).
 Progress = Callable[[int, int], object]
@@ -65,7 +66,7 @@ class Examination:
         self._files = files
         # Why checks are impossible for scans of these options.
         self.limits = metadata.limits
-        self._grid = metadata.grid(where)
+        self._grid = grid_of(metadata, where)
         self._grid_checks = GridChecks(log, self._grid, metadata.t_init_ns, where)
         self._by_time = metadata.sort == "points"
         self._is_fused = metadata.batching is not None

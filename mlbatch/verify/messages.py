@@ -9,20 +9,18 @@ import zlib
 from collections import Counter
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field, replace
-from typing import TypeAlias
 
 import numpy as np
-import numpy.typing as npt
 
-from mlbatch.arrays import F32Array, F64Array, I64Array, U8Array, U16Array
-from mlbatch.verify.containers import Message
-from mlbatch.verify.encoding import MessageCursor
+from mlbatch.arrays import F64Array
+from mlbatch.outputs.cloud_messages import CLOUD, read_cloud, stored_scan
+from mlbatch.outputs.containers import Message
+from mlbatch.outputs.damage import CheckLog, DamageError
+from mlbatch.outputs.encoding import MessageCursor
+from mlbatch.outputs.metadata import RunMetadata
 from mlbatch.verify.examination import Examination
-from mlbatch.verify.report_checks import Document, RunMetadata, poses_of
-from mlbatch.verify.scan import StoredScan
-from mlbatch.verify.verdict import CheckLog, DamageError
+from mlbatch.verify.report_checks import Document, poses_of
 
-CLOUD = "sensor_msgs/PointCloud2"
 IMU = "sensor_msgs/Imu"
 TRANSFORMS = "tf2_msgs/TFMessage"
 TF_STATIC = "/tf_static"
@@ -72,183 +70,6 @@ LAYOUT_LIMITS = {
     "rings": ("autoware", "kiss-icp", "minimal"),
     "returns": ("velodyne", "ouster", "hesai", "kiss-icp", "minimal"),
 }
-
-
-# -- point layouts --------------------------------------------------------------------------------
-
-Records: TypeAlias = npt.NDArray[np.void]
-# Name, offset and type code of each field.
-Fields: TypeAlias = tuple[tuple[str, int, int], ...]
-_CODES = {"u1": 2, "<u2": 4, "<u4": 6, "<f4": 7, "<f8": 8}
-
-
-@dataclass(frozen=True, slots=True)
-class Preset:
-    """A point layout."""
-
-    # Bytes of a point.
-    step: int
-    fields: Fields
-    # Field with the time of a point.
-    time: str | None
-    # Records; x, y and z also as one field xyz.
-    dtype: np.dtype[np.void]
-
-
-def _preset(step: int, time: str | None, text: str) -> Preset:
-    """A preset from `name:type@offset`, types as in numpy."""
-    names = []
-    types = []
-    offsets = []
-    for part in text.split():
-        name, _, rest = part.partition(":")
-        kind, _, offset = rest.partition("@")
-        names.append(name)
-        types.append(kind if kind == "u1" else f"<{kind}")
-        offsets.append(int(offset))
-    codes = [_CODES[kind] for kind in types]
-    dtype = np.dtype(
-        {
-            "names": ["xyz", *names],
-            "formats": [("<f4", 3), *types],
-            "offsets": [0, *offsets],
-            "itemsize": step,
-        }
-    )
-    return Preset(step, tuple(zip(names, offsets, codes, strict=True)), time, dtype)
-
-
-_XYZ = "x:f4@0 y:f4@4 z:f4@8"
-PRESETS = {
-    "standard": _preset(
-        24,
-        "time",
-        f"{_XYZ} intensity:f4@12 time:f4@16 ring:u2@20 return_type:u1@22 lidar_id:u1@23",
-    ),
-    "velodyne": _preset(22, "time", f"{_XYZ} intensity:f4@12 ring:u2@16 time:f4@18"),
-    "ouster": _preset(
-        48,
-        "t",
-        f"{_XYZ} intensity:f4@16 t:u4@20 reflectivity:u2@24 ring:u2@26 ambient:u2@28 range:u4@32",
-    ),
-    "hesai": _preset(26, "timestamp", f"{_XYZ} intensity:f4@12 ring:u2@16 timestamp:f8@18"),
-    "autoware": _preset(
-        32,
-        "time_stamp",
-        f"{_XYZ} intensity:u1@12 return_type:u1@13 channel:u2@14 azimuth:f4@16 elevation:f4@20 "
-        "distance:f4@24 time_stamp:u4@28",
-    ),
-    "kiss-icp": _preset(16, "time", f"{_XYZ} time:f4@12"),
-    "minimal": _preset(12, None, _XYZ),
-}
-
-
-@dataclass(frozen=True, slots=True)
-class Cloud:
-    """A PointCloud2."""
-
-    stamp_ns: int
-    frame_id: str
-    # Name of its preset.
-    layout: str
-    # (height, width)
-    records: Records
-    is_dense: bool
-
-
-def read_cloud(cursor: MessageCursor) -> Cloud:
-    """One message; DamageError if it is damaged or of no preset."""
-    stamp_ns, frame_id = cursor.header()
-    height = cursor.integer("I")
-    width = cursor.integer("I")
-    fields = []
-    for _ in range(cursor.integer("I")):
-        name = cursor.text()
-        offset = cursor.integer("I")
-        code = cursor.integer("B")
-        count = cursor.integer("I")
-        if count != 1:
-            raise DamageError("fields of one value", f"{name} of {count}")
-        fields.append((name, offset, code))
-    big_endian = cursor.integer("B")
-    step = cursor.integer("I")
-    row = cursor.integer("I")
-    layouts = [
-        name for name, one in PRESETS.items() if (one.step, one.fields) == (step, tuple(fields))
-    ]
-    if not layouts or big_endian:
-        found = ", ".join(f"{name}@{offset} type {code}" for name, offset, code in fields)
-        raise DamageError("little-endian fields of a point layout", f"{found}; step {step}")
-    data = cursor.bytes_of(cursor.integer("I"))
-    if row != step * width or len(data) != row * height:
-        raise DamageError(
-            f"{height} rows of {width} points of {step} bytes",
-            f"rows of {row} bytes, {len(data)} in all",
-        )
-    is_dense = bool(cursor.integer("B"))
-    cursor.end("a PointCloud2")
-    records = np.frombuffer(data, PRESETS[layouts[0]].dtype).reshape(height, width)
-    return Cloud(stamp_ns, frame_id, layouts[0], records, is_dense)
-
-
-def stored_scan(cloud: Cloud, where: str, sensor: int | None) -> StoredScan:
-    """The message as a scan; an organized one is transposed: its rows are columns."""
-    organized = not cloud.is_dense
-    records = cloud.records.T if organized else cloud.records.reshape(-1)
-    names = {name for name, _, _ in PRESETS[cloud.layout].fields}
-    time_ns, step_ns = _times(cloud, records)
-    xyz: F32Array = records["xyz"]
-    scan = StoredScan(where, cloud.stamp_ns, xyz, organized, sensor)
-    scan.time_ns = time_ns
-    scan.time_step_ns = step_ns
-    if "intensity" in names:
-        # An intensity of one byte has no NaN for empty slots.
-        if records.dtype["intensity"].kind == "f":
-            scan.intensity = records["intensity"]
-        else:
-            scan.byte_intensity = records["intensity"]
-    if "range" in names:
-        range_m: F64Array = records["range"] / 1000.0
-        scan.range_m = range_m
-    if "distance" in names:
-        distance_m: F32Array = records["distance"]
-        scan.distance_m = distance_m
-    if "azimuth" in names:
-        angles_rad: tuple[F32Array, F32Array] = (records["azimuth"], records["elevation"])
-        scan.angles_rad = angles_rad
-    # The `channel` of `autoware` is a ring of its sensor, not of the run.
-    if "ring" in names:
-        ring: U16Array = records["ring"]
-        scan.ring = ring
-    if "return_type" in names:
-        return_type: U8Array = records["return_type"]
-        scan.return_type = return_type
-    if "lidar_id" in names:
-        lidar_id: U8Array = records["lidar_id"]
-        scan.lidar_id = lidar_id
-    return scan
-
-
-def _times(cloud: Cloud, records: Records) -> tuple[I64Array | None, int]:
-    """Times after the stamp, ns, and their largest error."""
-    name = PRESETS[cloud.layout].time
-    if name is None:
-        return None, 0
-    values = records[name]
-    if name in ("t", "time_stamp"):
-        return values.astype(np.int64), 0
-    if not np.isfinite(values).all():
-        raise DamageError(f"a finite {name}", "NaN or infinity")
-    if name == "time":
-        # Rounded toward zero: never later than the true time.
-        time_s: F64Array = np.clip(values.astype(np.float64), -4.0, 4e9 / _NS)
-        step_s = float(np.spacing(np.float32(np.abs(time_s).max(initial=0))))
-        return np.floor(time_s * _NS).astype(np.int64), int(step_s * _NS) + 1
-    # Times of the clock; those of empty slots are the start.
-    whole_s, rest_ns = divmod(cloud.stamp_ns, _NS)
-    after_s: F64Array = np.clip(values - whole_s, -4.0, 5.0)
-    step_s = float(np.spacing(np.abs(values).max(initial=0)))
-    return np.rint(after_s * _NS).astype(np.int64) - rest_ns, int(step_s * _NS) + 1
 
 
 @dataclass(frozen=True, slots=True, eq=False)

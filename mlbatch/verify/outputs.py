@@ -12,23 +12,20 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from mlbatch.bounded import open_file
-from mlbatch.verify import messages, npz
+from mlbatch.outputs import npz
+from mlbatch.outputs.damage import CheckLog, DamageError, VerifyError
+from mlbatch.outputs.file_formats import FileFormat, format_of
+from mlbatch.outputs.float_rows import RowReader
+from mlbatch.outputs.folders import entries, refuse_shard, scan_files
+from mlbatch.outputs.metadata import RunMetadata, metadata_of_grid
+from mlbatch.verify import messages
 from mlbatch.verify.examination import Examination, Progress
-from mlbatch.verify.file_formats import FileFormat, format_of
-from mlbatch.verify.float_rows import RowReader
-from mlbatch.verify.folders import entries, refuse_shard, scan_files
 from mlbatch.verify.messages import LAYOUT_LIMITS, TopicChecks
-from mlbatch.verify.report_checks import (
-    TABLE,
-    ReportFiles,
-    ReportPlaces,
-    RunMetadata,
-    metadata_of_grid,
-)
-from mlbatch.verify.verdict import CheckLog, DamageError, Verdict, VerifyError
+from mlbatch.verify.report_checks import TABLE, ReportFiles, ReportPlaces
+from mlbatch.verify.verdict import Verdict, outcomes
 
 if TYPE_CHECKING:
-    from mlbatch.verify.rosbag2 import BagFile
+    from mlbatch.outputs.rosbag2 import BagFile
 
 _METADATA = "metadata.yaml"
 # In mlbatch.grid of each of several files; their report and table are in the folder.
@@ -69,7 +66,7 @@ class Output:
             scans=totals.scans,
             points=totals.points,
             columns=totals.columns if totals.knows_columns else None,
-            checks=self.log.outcomes(limits),
+            checks=outcomes(self.log, limits),
             violations=tuple(self.log.violations),
         )
 
@@ -138,7 +135,7 @@ def _check_files(form: FileFormat, output: Output) -> Verdict:
 
 
 def _check_rosbag2(output: Output) -> Verdict:
-    from mlbatch.verify.rosbag2 import check_metadata, open_bag
+    from mlbatch.outputs.rosbag2 import check_metadata, open_bag
 
     paths, about = open_bag(output.log, output.path)
 
@@ -154,8 +151,8 @@ def _check_mcap(
     name: str,
     check_yaml: Callable[[TopicChecks, Sequence[BagFile]], None] | None = None,
 ) -> Verdict:
-    from mlbatch.verify.mcap_file import McapFile
-    from mlbatch.verify.rosbag2 import BagFile
+    from mlbatch.outputs.mcap_file import McapFile
+    from mlbatch.outputs.rosbag2 import BagFile
 
     log = output.log
     grids = []
@@ -204,7 +201,7 @@ def _check_mcap(
 
 
 def _check_bag(output: Output) -> Verdict:
-    from mlbatch.verify.rosbag1 import LIMITS, BagFile
+    from mlbatch.outputs.rosbag1 import LIMITS, BagFile
 
     log = output.log
     path = output.path

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field
 from fractions import Fraction
 from pathlib import Path
 from typing import TypeAlias, cast
@@ -13,10 +12,11 @@ import numpy as np
 from mlbatch.arrays import BoolArray, F64Array, I64Array
 from mlbatch.bounded import MOST_TABLE_BYTES, parse_json, read_text
 from mlbatch.errors import UsageError
+from mlbatch.outputs.damage import CheckLog, VerifyError
+from mlbatch.outputs.metadata import VARIANTS, RunMetadata, with_variants
 from mlbatch.units import parse_rate
 from mlbatch.verify.scan_checks import Grid
 from mlbatch.verify.table import OutputTotals, Table, read_table
-from mlbatch.verify.verdict import CheckLog, VerifyError
 
 REPORT = "report.json"
 TABLE = "scans.csv"
@@ -52,124 +52,19 @@ Keys: TypeAlias = "tuple[str | int, ...]"
 # -- metadata of the run --------------------------------------------------------------------------
 
 
-@dataclass(frozen=True, slots=True)
-class RunMetadata:
-    """Metadata of a run as one place has it; None for what it does not have."""
-
-    # Text, as in all outputs.
-    rate: str | None = None
-    slices: int | None = None
-    t_init_ns: int | None = None
-    sensors: tuple[str, ...] | None = None
-    timescale: str | None = None
-    frame_id: str | None = None
-    # Order of points: columns or points.
-    sort: str | None = None
-    # Options that change what a scan is; None: the default.
-    batching: str | None = None
-    batching_times: str | None = None
-    stamp: str | None = None
-    deskew: str | None = None
-    deskew_to: str | None = None
-
-    @property
-    def limits(self) -> dict[str, str]:
-        """Checks that such options make impossible, and why."""
-        limits: dict[str, str] = {}
-        if self.batching is not None:
-            reason = f"sets of sweeps (--batching {self.batching}) are on no grid"
-            limits |= dict.fromkeys(("grid", "t_init"), reason)
-        if self.batching_times == "own":
-            limits["order"] = "columns only: times of points count from the start of each sweep"
-        if self.deskew is not None:
-            limits["geometry"] = "points were moved (--deskew): ranges are as measured"
-        return limits
-
-    def joined(self, log: CheckLog, where: str, other: RunMetadata) -> RunMetadata:
-        """Both together; contradictions are violations at `where`."""
-        found = self
-        for item in fields(self):
-            own = getattr(found, item.name)
-            new = getattr(other, item.name)
-            if own is None:
-                found = replace(found, **{item.name: new})
-            elif new is not None:
-                log.equal("metadata", f"{where} {item.name}", own, new)
-        return found
-
-    def grid(self, where: str) -> Grid | None:
-        """The grid; None without a rate, and of sets of sweeps."""
-        if self.rate is None or self.batching is not None:
-            return None
-        slices = 1 if self.slices is None else self.slices
-        try:
-            rate: Fraction = parse_rate(self.rate)
-        except UsageError as err:
-            raise VerifyError(f"{where}: {err}") from err
-        if not 1 <= slices <= _MOST_SLICES:
-            expected = f"1 to {_MOST_SLICES} slices a window"
-            raise VerifyError(f"{where}: expected {expected}, found {slices}; convert again")
-        return Grid(rate, slices)
-
-
-VARIANTS = ("batching", "batching_times", "stamp", "deskew", "deskew_to")
-_VARIANT_WORDS = {
-    "batching": ("latest", "approximate", "collate"),
-    "batching_times": ("common", "own"),
-    "stamp": ("middle", "end"),
-    "deskew_to": ("start", "middle", "end"),
-}
-
-
-def with_variants(
-    log: CheckLog, where: str, own: RunMetadata, said: Mapping[str, str]
-) -> RunMetadata:
-    """Metadata with the options in `said` that change what a scan is."""
-    known = {name: said[name] for name in VARIANTS if name in said}
-    for name, words in _VARIANT_WORDS.items():
-        if name in known and known[name] not in words:
-            log.fail("metadata", f"{where} {name}", f"one of {', '.join(words)}", known[name])
-            del known[name]
-    return replace(
-        own,
-        batching=known.get("batching"),
-        batching_times=known.get("batching_times"),
-        stamp=known.get("stamp"),
-        deskew=known.get("deskew"),
-        deskew_to=known.get("deskew_to"),
-    )
-
-
-def metadata_of_grid(log: CheckLog, where: str, grid: dict[str, str]) -> RunMetadata:
-    """Metadata in the metadata record mlbatch.grid of an MCAP file."""
-    where = f"{where} mlbatch.grid"
-    numbers: dict[str, int | None] = {}
-    for key in ("slices", "t_init_ns"):
-        text = grid.get(key, "")
-        numbers[key] = int(text) if text.isdecimal() and len(text) <= _MOST_DIGITS else None
-        log.ok("metadata")
-        if numbers[key] is None:
-            log.fail("metadata", f"{where} {key}", "a number", text or "nothing")
-    for key in ("rate_hz", "timescale", "frame_id", "sort"):
-        if key not in grid:
-            log.fail("metadata", f"{where} {key}", "a text", "nothing")
+def grid_of(metadata: RunMetadata, where: str) -> Grid | None:
+    """The grid of a run; None without a rate, and of sets of sweeps."""
+    if metadata.rate is None or metadata.batching is not None:
+        return None
+    slices = 1 if metadata.slices is None else metadata.slices
     try:
-        names = parse_json(grid.get("sensors", ""))
-    except ValueError:
-        names = None
-    if not isinstance(names, list):
-        log.fail("metadata", f"{where} sensors", "a list", grid.get("sensors"))
-        names = None
-    found = RunMetadata(
-        rate=grid.get("rate_hz"),
-        slices=numbers["slices"],
-        t_init_ns=numbers["t_init_ns"],
-        sensors=None if names is None else tuple(map(str, names)),
-        timescale=grid.get("timescale"),
-        frame_id=grid.get("frame_id"),
-        sort=grid.get("sort"),
-    )
-    return with_variants(log, where, found, grid)
+        rate: Fraction = parse_rate(metadata.rate)
+    except UsageError as err:
+        raise VerifyError(f"{where}: {err}") from err
+    if not 1 <= slices <= _MOST_SLICES:
+        expected = f"1 to {_MOST_SLICES} slices a window"
+        raise VerifyError(f"{where}: expected {expected}, found {slices}; convert again")
+    return Grid(rate, slices)
 
 
 # -- the report as a document ---------------------------------------------------------------------

@@ -11,8 +11,8 @@ import numpy as np
 import numpy.typing as npt
 
 from mlbatch.arrays import BoolArray, F32Array, F64Array, I64Array, U8Array
-from mlbatch.verify.scan import COLUMN_NS, Points, StoredScan
-from mlbatch.verify.verdict import CheckLog
+from mlbatch.outputs.damage import CheckLog
+from mlbatch.outputs.stored_scan import COLUMN_NS, Points, StoredScan
 
 Plane: TypeAlias = npt.NDArray[np.generic]
 _NS = 10**9

@@ -12,9 +12,9 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from mlbatch.arrays import BoolArray, F64Array, I64Array
-from mlbatch.verify.scan import COLUMN_NS, Points, StoredScan
+from mlbatch.outputs.damage import CheckLog
+from mlbatch.outputs.stored_scan import COLUMN_NS, Points, StoredScan
 from mlbatch.verify.scan_checks import Grid
-from mlbatch.verify.verdict import CheckLog
 
 _FIRST = ("index", "slice", "start_ns", "end_ns", "first_stamp_ns", "last_stamp_ns")
 _COUNTS = ("points", "columns")

@@ -2,14 +2,9 @@
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
-import numpy as np
-
-from mlbatch.arrays import BoolArray
-from mlbatch.errors import MlbatchError
+from mlbatch.outputs.damage import CheckLog, Violation
 
 # Every check and what it requires, in the order in which a verdict shows them.
 CHECKS = {
@@ -39,35 +34,6 @@ CHECKS = {
     "imu": "IMU messages are in order of time, at the time of their header",
     "messages": "the counts of forwarded messages agree with the report",
 }
-# Violations that are kept; all are counted.
-MAX_KEPT = 1000
-_MAX_TEXT = 160
-
-
-class VerifyError(MlbatchError):
-    """An output that cannot be checked: missing, of another program, damaged beyond reading."""
-
-
-class DamageError(Exception):
-    """Bytes that do not follow their format."""
-
-    def __init__(self, expected: str, found: str) -> None:
-        super().__init__(f"expected {expected}, found {found}")
-        self.expected = expected
-        self.found = found
-
-
-@dataclass(frozen=True, slots=True)
-class Violation:
-    """A value that breaks a check; `where`: file, then scan, column or point."""
-
-    check: str
-    where: str
-    expected: str
-    found: str
-
-    def __str__(self) -> str:
-        return f"{self.check}: {self.where}: expected {self.expected}, found {self.found}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -115,66 +81,14 @@ class Verdict:
         return self.count == 0
 
 
-@dataclass(slots=True)
-class CheckLog:
-    """Counts checked values and collects violations."""
-
-    checked: Counter[str] = field(default_factory=Counter)
-    failed: Counter[str] = field(default_factory=Counter)
-    violations: list[Violation] = field(default_factory=list)
-
-    def ok(self, check: str, count: int = 1) -> None:
-        """Count `count` checked values."""
-        self.checked[check] += count
-
-    def fail(self, check: str, where: str, expected: object, found: object) -> None:
-        """Add a violation."""
-        self.failed[check] += 1
-        if len(self.violations) < MAX_KEPT:
-            self.violations.append(Violation(check, where, _short(expected), _short(found)))
-
-    def equal(self, check: str, where: str, expected: object, found: object) -> bool:
-        """Check one value against another."""
-        self.checked[check] += 1
-        if expected == found:
-            return True
-        self.fail(check, where, expected, found)
-        return False
-
-    def none(
-        self,
-        check: str,
-        where: str,
-        bad: BoolArray,
-        expected: str,
-        found: Callable[[int], object],
-    ) -> bool:
-        """Check that no value is bad; a violation has the flat index of the first, and the count.
-
-        found: value at a flat index.
-        """
-        self.checked[check] += bad.size
-        if not bad.any():
-            return True
-        first = int(bad.argmax())
-        count = int(np.count_nonzero(bad))
-        more = f" ({count} of {bad.size})" if count > 1 else ""
-        self.fail(check, f"{where} {first}", expected, f"{found(first)}{more}")
-        return False
-
-    def outcomes(self, limits: dict[str, str]) -> tuple[Check, ...]:
-        """All checks; limits: by check, why it is not or only partly checkable."""
-        return tuple(
-            Check(
-                name,
-                self.checked[name],
-                self.failed[name],
-                limits.get(name, "" if self.checked[name] else "no such data in this output"),
-            )
-            for name in CHECKS
+def outcomes(log: CheckLog, limits: dict[str, str]) -> tuple[Check, ...]:
+    """All checks; limits: by check, why it is not or only partly checkable."""
+    return tuple(
+        Check(
+            name,
+            log.checked[name],
+            log.failed[name],
+            limits.get(name, "" if log.checked[name] else "no such data in this output"),
         )
-
-
-def _short(value: object) -> str:
-    text = " ".join(str(value).split())
-    return text if len(text) <= _MAX_TEXT else f"{text[: _MAX_TEXT - 3]}..."
+        for name in CHECKS
+    )

@@ -14,7 +14,7 @@ import rosbags.rosbag1 as bags
 from mcap.reader import make_reader
 from mcap.writer import CompressionType, Writer
 
-from mlbatch.verify.messages import PRESETS
+from mlbatch.outputs.cloud_messages import PRESETS
 from tests.builders.rosbag1 import definition_of
 from tests.builders.verify_outputs import Edit
 

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from mcap.reader import make_reader
 
+from mlbatch.outputs.cloud_messages import read_cloud
+from mlbatch.outputs.encoding import MessageCursor
 from mlbatch.types import Scan
-from mlbatch.verify.encoding import MessageCursor
-from mlbatch.verify.messages import read_cloud
 from mlbatch.writers.message_writer import CloudMessage
 from mlbatch.writers.point_layouts import CLOUD_LAYOUTS, clipped_points
 from tests.builders.captures import udp_frame, write_pcap

@@ -12,9 +12,9 @@ from pathlib import Path
 import pytest
 import zstandard
 
+from mlbatch.outputs.damage import DamageError
+from mlbatch.outputs.mcap_file import unpacked
 from mlbatch.verify import VerifyError, verify
-from mlbatch.verify.mcap_file import unpacked
-from mlbatch.verify.verdict import DamageError
 from tests.builders.verify_outputs import Case, Edit, cases, check_case, damaged, made, raw
 
 MB = 1 << 20

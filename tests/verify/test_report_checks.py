@@ -6,9 +6,9 @@ from pathlib import Path
 
 import pytest
 
+from mlbatch.outputs.damage import CheckLog
+from mlbatch.outputs.metadata import metadata_of_grid
 from mlbatch.verify import VerifyError, verify
-from mlbatch.verify.report_checks import metadata_of_grid
-from mlbatch.verify.verdict import CheckLog
 from tests.builders.verify_outputs import (
     PERIOD_NS,
     Case,

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from mlbatch.errors import MlbatchError
+from mlbatch.outputs.damage import MAX_KEPT, CheckLog
 from mlbatch.verify import CHECKS, VerifyError
-from mlbatch.verify.verdict import MAX_KEPT, CheckLog
+from mlbatch.verify.verdict import outcomes
 
 
 def test_a_violation_names_the_first_and_counts_all() -> None:
@@ -16,7 +17,7 @@ def test_a_violation_names_the_first_and_counts_all() -> None:
     assert not log.none("finite", "a.npz point", bad, "numbers", lambda at: f"value {at}")
     (violation,) = log.violations
     assert str(violation) == "finite: a.npz point 1: expected numbers, found value 1 (2 of 3)"
-    outcome = {check.name: check for check in log.outcomes({"order": "no columns"})}
+    outcome = {check.name: check for check in outcomes(log, {"order": "no columns"})}
     assert (outcome["finite"].outcome, outcome["finite"].checked) == ("violated", 3)
     assert (outcome["order"].outcome, outcome["order"].limit) == ("not checkable", "no columns")
     assert list(outcome) == list(CHECKS)

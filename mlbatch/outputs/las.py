@@ -16,10 +16,10 @@ import numpy as np
 
 from mlbatch.arrays import BoolArray, F32Array, F64Array, I64Array
 from mlbatch.errors import install_extra
-from mlbatch.verify.commented import CommentedReader, StoredPoints
-from mlbatch.verify.comments import ScanComments
-from mlbatch.verify.containers import check_unpacked_size, library_errors
-from mlbatch.verify.verdict import DamageError, VerifyError
+from mlbatch.outputs.commented import CommentedReader, StoredPoints
+from mlbatch.outputs.comments import ScanComments
+from mlbatch.outputs.containers import check_unpacked_size, library_errors
+from mlbatch.outputs.damage import DamageError, VerifyError
 
 LAS_SUFFIX = ".las"
 LAZ_SUFFIX = ".laz"

@@ -18,11 +18,11 @@ import numpy.typing as npt
 from numpy.lib.format import read_array_header_1_0, read_magic
 
 from mlbatch.arrays import F32Array, I64Array, U8Array, U16Array, U32Array
-from mlbatch.verify.containers import check_unpacked_size, library_errors
-from mlbatch.verify.folders import ScanFile, readable
-from mlbatch.verify.report_checks import VARIANTS, RunMetadata, with_variants
-from mlbatch.verify.scan import StoredScan
-from mlbatch.verify.verdict import CheckLog, DamageError
+from mlbatch.outputs.containers import check_unpacked_size, library_errors
+from mlbatch.outputs.damage import CheckLog, DamageError
+from mlbatch.outputs.folders import ScanFile, readable
+from mlbatch.outputs.metadata import VARIANTS, RunMetadata, with_variants
+from mlbatch.outputs.stored_scan import StoredScan
 
 SUFFIX = ".npz"
 SCHEMA = "mlbatch.scan/1"

@@ -13,7 +13,7 @@ from typing import NamedTuple, TypeAlias
 import yaml
 
 from mlbatch.bounded import read_text
-from mlbatch.verify.verdict import CheckLog, VerifyError
+from mlbatch.outputs.damage import CheckLog, VerifyError
 
 METADATA = "metadata.yaml"
 _VERSION = 5

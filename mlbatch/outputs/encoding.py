@@ -10,7 +10,7 @@ import struct
 from dataclasses import dataclass
 from typing import TypeAlias
 
-from mlbatch.verify.verdict import DamageError
+from mlbatch.outputs.damage import DamageError
 
 Buffer: TypeAlias = "bytes | memoryview"
 _CDR_HEAD = b"\x00\x01\x00\x00"

@@ -9,8 +9,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from mlbatch.bounded import MOST_TABLE_BYTES, read_bytes
-from mlbatch.verify.scan import StoredScan
-from mlbatch.verify.verdict import CheckLog, DamageError, VerifyError
+from mlbatch.outputs.damage import CheckLog, DamageError, VerifyError
+from mlbatch.outputs.stored_scan import StoredScan
 
 _NAME = re.compile(r"(?:(\d{6,})|(head))(?:-(\d+))?", re.ASCII)
 # What a shard has instead of a report.

@@ -10,11 +10,11 @@ import numpy as np
 import numpy.typing as npt
 
 from mlbatch.arrays import BoolArray, F32Array, F64Array, I64Array, U8Array
-from mlbatch.verify.comments import ScanComments
-from mlbatch.verify.folders import ScanFile, readable
-from mlbatch.verify.report_checks import RunMetadata
-from mlbatch.verify.scan import StoredScan
-from mlbatch.verify.verdict import CheckLog, DamageError
+from mlbatch.outputs.comments import ScanComments
+from mlbatch.outputs.damage import CheckLog, DamageError
+from mlbatch.outputs.folders import ScanFile, readable
+from mlbatch.outputs.metadata import RunMetadata
+from mlbatch.outputs.stored_scan import StoredScan
 
 _NS = 1e9
 _MOST_S = 4.0

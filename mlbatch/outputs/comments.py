@@ -10,8 +10,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from mlbatch.arrays import F32Array
-from mlbatch.verify.report_checks import RunMetadata, with_variants
-from mlbatch.verify.verdict import CheckLog, DamageError
+from mlbatch.outputs.damage import CheckLog, DamageError
+from mlbatch.outputs.metadata import RunMetadata, with_variants
 
 # Numbers of up to 19 digits: Python refuses very long ones.
 _INDEX = re.compile(r"(-?\d{1,19}) slice (\d{1,19}) of (\d{1,19})", re.ASCII)

@@ -9,9 +9,9 @@ import re
 
 import numpy as np
 
-from mlbatch.verify.commented import CommentedReader, StoredPoints
-from mlbatch.verify.comments import ScanComments
-from mlbatch.verify.verdict import DamageError
+from mlbatch.outputs.commented import CommentedReader, StoredPoints
+from mlbatch.outputs.comments import ScanComments
+from mlbatch.outputs.damage import DamageError
 
 SUFFIX = ".pcd"
 # Name, size, kind and numpy type.

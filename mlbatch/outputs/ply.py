@@ -11,9 +11,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mlbatch.verify.commented import CommentedReader, StoredPoints
-from mlbatch.verify.comments import ScanComments
-from mlbatch.verify.verdict import DamageError
+from mlbatch.outputs.commented import CommentedReader, StoredPoints
+from mlbatch.outputs.comments import ScanComments
+from mlbatch.outputs.damage import DamageError
 
 SUFFIX = ".ply"
 _TYPES = {"float": "<f4", "double": "<f8", "int": "<i4", "uchar": "u1"}

@@ -33,14 +33,14 @@ from mcap.records import (
 from mcap.records import Message as McapMessage
 from mcap.stream_reader import StreamReader
 
-from mlbatch.verify.containers import (
+from mlbatch.outputs.containers import (
     BoundedFile,
     Message,
     WholeReads,
     check_unpacked_size,
     library_errors,
 )
-from mlbatch.verify.verdict import CheckLog, DamageError, VerifyError
+from mlbatch.outputs.damage import CheckLog, DamageError, VerifyError
 
 MCAP_MAGIC = b"\x89MCAP0\r\n"
 _HEAD = struct.Struct("<BQ")

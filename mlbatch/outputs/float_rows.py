@@ -14,10 +14,10 @@ import numpy as np
 
 from mlbatch.arrays import BoolArray, F32Array, F64Array, I64Array
 from mlbatch.bounded import read_text
-from mlbatch.verify.folders import ScanFile, readable, scan_files
-from mlbatch.verify.report_checks import RunMetadata
-from mlbatch.verify.scan import StoredScan
-from mlbatch.verify.verdict import CheckLog, DamageError
+from mlbatch.outputs.damage import CheckLog, DamageError
+from mlbatch.outputs.folders import ScanFile, readable, scan_files
+from mlbatch.outputs.metadata import RunMetadata
+from mlbatch.outputs.stored_scan import StoredScan
 
 KITTI_SUFFIX = ".bin"
 NUSCENES_SUFFIX = ".pcd.bin"

@@ -13,7 +13,7 @@ from io import SEEK_END, BufferedReader, BytesIO
 from pathlib import Path
 
 from mlbatch.bounded import open_file
-from mlbatch.verify.verdict import DamageError
+from mlbatch.outputs.damage import DamageError
 
 # Largest unpacked size: this, or this multiple of the stored bytes. Scans shrink to a half or a
 # tenth; decompression bombs are a thousand times larger than their stored bytes.

@@ -10,11 +10,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeAlias
 
-from mlbatch.verify import float_rows, las, npz, pcd, ply
-from mlbatch.verify.commented import CommentedReader
-from mlbatch.verify.float_rows import RowReader
-from mlbatch.verify.npz import NpzReader
-from mlbatch.verify.verdict import CheckLog
+from mlbatch.outputs import float_rows, las, npz, pcd, ply
+from mlbatch.outputs.commented import CommentedReader
+from mlbatch.outputs.damage import CheckLog
+from mlbatch.outputs.float_rows import RowReader
+from mlbatch.outputs.npz import NpzReader
 
 FileReader: TypeAlias = NpzReader | CommentedReader | RowReader
 

@@ -16,8 +16,8 @@ from typing import TypeAlias
 from rosbags.rosbag1 import Reader
 from rosbags.rosbag1.reader import Header, RecordType, read_uint32
 
-from mlbatch.verify.containers import BoundedFile, Message, WholeReads, library_errors
-from mlbatch.verify.verdict import CheckLog, DamageError, VerifyError
+from mlbatch.outputs.containers import BoundedFile, Message, WholeReads, library_errors
+from mlbatch.outputs.damage import CheckLog, DamageError, VerifyError
 
 BAG_MAGIC = b"#ROSBAG V2.0\n"
 LIMITS = {"container": "lengths and indexes; bags have no checksums"}
