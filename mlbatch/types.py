@@ -332,10 +332,6 @@ class SensorInfo:
     sensor_from_imu: F64Array | None = field(default=None, compare=False)
 
 
-# Instants of a window: words of `--stamp` and `--deskew-to`.
-INSTANTS = ("start", "middle", "end")
-
-
 def instant_ns(word: str, start_ns: int, end_ns: int) -> int:
     """Return an instant of a window [start_ns, end_ns) by a word of INSTANTS."""
     return {"start": start_ns, "middle": (start_ns + end_ns) // 2, "end": end_ns}[word]

@@ -17,11 +17,9 @@ from mlbatch.units import NS_PER_S
 
 # Words of `--batching`: windows are on the grid; the others are policies of `fusion.py`.
 WINDOW = "window"
-BATCHINGS = (WINDOW, "latest", "approximate", "collate")
 # Words of `--batching-times`: times of points count from the start of the set, or of their sweep.
 COMMON = "common"
 OWN = "own"
-TIMES = (COMMON, OWN)
 
 
 @dataclass(frozen=True, slots=True)

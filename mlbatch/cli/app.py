@@ -61,16 +61,17 @@ class Command(TyperCommand):
             value = ctx.params.get(param.name)
             values = value if isinstance(value, (list, tuple)) else [value]
             is_path = param.type.name in _PATH_TYPES
-            name = param.human_readable_name if param.param_type_name == "argument" else ""
+            is_argument = param.param_type_name == "argument"
+            name = param.human_readable_name if is_argument else max(param.opts, key=len)
             # As a path, it would be the current folder.
             if is_path and "" in map(str, values):
                 raise UsageError(
-                    f"{name or param.opts[0]}: expected a path, found an empty word; check that "
+                    f"{name}: expected a path, found an empty word; check that "
                     "the variable of the shell is set"
                 )
             if is_path and "-" in map(str, values) and (self.name, param.name) not in PRINTABLE:
                 raise UsageError(
-                    f"{name or param.opts[0]}: expected a path, found -: neither standard input "
+                    f"{name}: expected a path, found -: neither standard input "
                     "nor standard output can be used here; give a file or folder"
                 )
         if self.name != "convert":

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import inspect
 import sys
-import typing
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from mlbatch.cli.convert import convert
+from mlbatch import options
+from mlbatch.cli.parameters import parameter, with_parameters
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -20,8 +19,10 @@ if TYPE_CHECKING:
     from mlbatch.batch.session import Option
 
 # Options of `convert` that a batch has itself, or that have no meaning for many sessions.
-_OWN = ("recordings", "output", "rig", "jobs", "only", "overwrite", "resume", "quiet", "verbose")
+_OWN = ("output", "rig", "jobs", "only", "overwrite", "resume", "quiet", "verbose")
 _WITHOUT = (*_OWN, "report", "html", "dry_run", "shard")
+# Those that are passed to every session, by their names as parameters.
+_FORWARDED = {parameter(one).name: one for one in options.CONVERT if one.name not in _WITHOUT}
 
 
 def batch(
@@ -79,7 +80,7 @@ def batch(
     ] = None,
     cache_gb: Annotated[float, typer.Option(help="Largest size of the cache, GB.")] = 100.0,
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No table, no progress.")] = False,
-    **options: Any,
+    **values: Any,
 ) -> None:
     """Convert many sessions, a process each; a second run does what is missing or changed."""
     from mlbatch.batch.cache import Cache
@@ -100,7 +101,7 @@ def batch(
         raise UsageError(f"--cache-gb: expected more than 0 GB, found {cache_gb}; write 100")
     jobs = _jobs(jobs, workers)
     numbers = parse_part(part)
-    given = Common(rig, tuple(_given(context, options, jobs)))
+    given = Common(rig, tuple(_given(context, values, jobs)))
     if rig is not None and not is_url(rig):
         # A mistake in it would fail every session.
         read_rig(Path(rig))
@@ -128,36 +129,11 @@ def batch(
 # -- options of `convert` ---------------------------------------------------------------------
 
 
-def _forwarded() -> dict[str, inspect.Parameter]:
-    """Options of `convert` that are passed to every session."""
-    return {
-        name: parameter.replace(kind=inspect.Parameter.KEYWORD_ONLY)
-        for name, parameter in inspect.signature(convert, eval_str=True).parameters.items()
-        if name not in _WITHOUT
-    }
-
-
-def _long_name(name: str, parameter: inspect.Parameter) -> str:
-    """An option as typed."""
-    info = typing.get_args(parameter.annotation)[1]
-    # typer has the first name in the place of a default.
-    words = [info.default, *(info.param_decls or ())]
-    named = [word for word in words if str(word).startswith("--")]
-    return str(named[0]) if named else f"--{name.replace('_', '-')}"
-
-
-def _kind(parameter: inspect.Parameter) -> str:
-    kind = typing.get_args(parameter.annotation)[0]
-    if kind is bool:
-        return "flag"
-    return "list" if "list" in str(kind) else "value"
-
-
 def _kinds() -> dict[str, str]:
     """Options that a manifest may have, by name without dashes."""
+    kinds = {options.FLAG: "flag", options.TEXTS: "list", options.PATHS: "list"}
     found = {
-        _long_name(name, parameter).removeprefix("--"): _kind(parameter)
-        for name, parameter in _forwarded().items()
+        one.long.removeprefix("--"): kinds.get(one.kind, "value") for one in _FORWARDED.values()
     }
     # `--only` of the batch names sessions.
     return found | {"only": "list", "jobs": "value"}
@@ -174,16 +150,15 @@ def _jobs(asked: str | None, workers: int) -> str | None:
     return asked
 
 
-def _given(context: typer.Context, options: dict[str, Any], jobs: str | None) -> Iterator[Option]:
+def _given(context: typer.Context, given: dict[str, Any], jobs: str | None) -> Iterator[Option]:
     """The options of `convert` on this command line."""
     from mlbatch.batch.session import Option
 
-    forwarded = _forwarded()
-    for name, value in options.items():
+    for name, value in given.items():
         source = context.get_parameter_source(name)
         if source is None or source.name == "DEFAULT":
             continue
-        long_name = _long_name(name, forwarded[name])
+        long_name = _FORWARDED[name].long
         if isinstance(value, bool):
             yield Option(long_name)
         else:
@@ -202,19 +177,7 @@ def _check_counts(**counts: int) -> None:
             raise UsageError(f"--{name}: expected {least} to 1000, found {count}; correct it")
 
 
-def _signature() -> inspect.Signature:
-    """Own options, then those of `convert`: the parser describes a command by its signature."""
-    own = [
-        parameter
-        for name, parameter in inspect.signature(batch, eval_str=True).parameters.items()
-        if name != "options"
-    ]
-    return inspect.Signature([*own, *_forwarded().values()])
-
-
-_found = _signature()
-batch.__signature__ = _found  # type: ignore[attr-defined]
-batch.__annotations__ = {name: one.annotation for name, one in _found.parameters.items()}
+with_parameters(batch, map(parameter, _FORWARDED.values()))
 
 
 # -- output -----------------------------------------------------------------------------------

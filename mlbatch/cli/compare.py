@@ -12,14 +12,13 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from mlbatch.cli.words import one_of
+from mlbatch.cli.parameters import is_stdout, one_of
 from mlbatch.errors import UsageError, one_line
+from mlbatch.options import CLOCKS
 from mlbatch.units import NS_PER_S
 
 if TYPE_CHECKING:
     from mlbatch.compare.compare import Comparison
-
-CLOCKS = ("sensor", "host")
 
 
 def compare(
@@ -85,22 +84,23 @@ def compare(
     ] = False,
 ) -> None:
     """Compare frame-level fusion of lidars with windows: time spans, columns, stale data."""
-    from mlbatch.cli import options
     from mlbatch.cli.progress import progress_bar
     from mlbatch.cli.tables import paragraph, table_lines
+    from mlbatch.cli.values import rate as read_rate
     from mlbatch.compare.compare import Settings, compare
     from mlbatch.discovery.discover import SensorSelection
     from mlbatch.pipeline.job import Job
+    from mlbatch.python.options import choice
     from mlbatch.readers.inputs import expand
 
-    options.choice("--clock", clock, CLOCKS)
+    choice("--clock", clock, CLOCKS)
     settings = Settings(
         _duration_ns("--tolerance", tolerance),
         _duration_ns("--timeout", timeout),
     )
     selection = SensorSelection(rig=rig, metadata=tuple(metadata or ()), host_clock=clock == "host")
-    job = Job(expand(recordings), selection, rate=None if rate is None else options.rate(rate))
-    prints_page = options.is_stdout(html)
+    job = Job(expand(recordings), selection, rate=None if rate is None else read_rate(rate))
+    prints_page = is_stdout(html)
     if prints_page and as_json:
         raise UsageError(
             "--html -: expected standard output for the page alone, found --json; leave one out"

@@ -9,6 +9,8 @@ import sys
 from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING, Any
 
+from mlbatch import options
+
 if TYPE_CHECKING:
     from rich.table import Table
 
@@ -18,56 +20,31 @@ OTHER = "Options"
 MAX_WIDTH = 120
 # Rows of a group: names of a parameter and their help.
 Rows = list[tuple[str, str]]
-# Parameters of each group, in the order of help; what is in none is listed last, as OTHER.
-GROUPS: Mapping[str, tuple[str, ...]] = {
-    "Input": (*("recordings", "rig", "metadata", "decode", "identity_extrinsics", "whole"),),
-    "Batching": (
-        *("batching", "batching_times", "deskew", "deskew_to"),
-        *("rate", "slices", "split", "max_wait", "keep_partial", "drop_incomplete"),
-        *("tolerance", "timeout"),
-    ),
-    "Selection": (
-        *("only", "ignore", "start", "end", "min_range", "max_range", "exclude_box"),
-        *("keep_repeated", "pass_"),
-    ),
-    "Output": (
-        *(
-            "output",
-            "format_",
-            "layout",
-            "sort",
-            "point_layout",
-            "stamp",
-            "ply_style",
-            "max_bag_duration",
-            "compression",
-            "report",
-            "html",
-        ),
-        *("figures", "as_json", "write_rig", "overwrite", "no_fsync"),
-    ),
-    "Clocks": ("clock", "align_clocks", "align_to", "on_jump"),
-    "Run": (
-        *("dry_run", "shard", "jobs", "resume", "strict", "fail_on"),
-        *("fault", "fault_seed", "quiet", "verbose", "help"),
-    ),
+# Of the options of each group, in the order of help; those that not only `convert` has come last.
+_OTHERS: Mapping[str, str] = {
+    **{"recordings": "Input", "whole": "Input", "tolerance": "Batching", "timeout": "Batching"},
+    **{name: "Output" for name in ("figures", "as_json", "write_rig")},
+    "help": "Run",
 }
+_GROUP_OF = {
+    **_OTHERS,
+    **{option.name: option.group for option in options.CONVERT},
+}
+_PLACES = {name: at for at, name in enumerate((*options.BY_NAME, *_OTHERS))} | {"recordings": -1}
 # Commands with few options have no groups.
 GROUPED = ("convert", "inspect", "compare")
-_GROUP_OF = {name: group for group, names in GROUPS.items() for name in names}
 
 
 def groups_of(command: Any, context: Any) -> dict[str, Rows]:
-    """Rows of help by group, both in the order of GROUPS."""
+    """Rows of help by group, both in the order of the table of options."""
     found: dict[str, list[tuple[int, tuple[str, str]]]] = {}
     for param in command.get_params(context):
         record = param.get_help_record(context)
         if record is not None:
-            group = _group(command.name, param)
-            names = GROUPS.get(group, ())
-            place = names.index(param.name) if param.name in names else len(names)
-            found.setdefault(group, []).append((place, record))
-    order = [ARGUMENTS, *GROUPS, OTHER]
+            is_grouped = command.name in GROUPED
+            place = _PLACES.get(param.name.rstrip("_"), len(_PLACES)) if is_grouped else 0
+            found.setdefault(_group(command.name, param), []).append((place, record))
+    order = [ARGUMENTS, *options.GROUPS, OTHER]
     titles = sorted(found, key=lambda group: order.index(group) if group in order else len(order))
     return {
         title: [record for _, record in sorted(found[title], key=lambda row: row[0])]
@@ -79,7 +56,7 @@ def _group(command: str, param: Any) -> str:
     given = getattr(param, "rich_help_panel", None)
     if given or command not in GROUPED:
         return given or (ARGUMENTS if param.param_type_name == "argument" else OTHER)
-    return _GROUP_OF.get(param.name, OTHER)
+    return _GROUP_OF.get(param.name.rstrip("_"), OTHER)
 
 
 def command_rows(group: Any, context: Any) -> Rows:

@@ -35,7 +35,7 @@ def report(
 ) -> None:
     """Write a page (HTML) of a run: verdict, timeline, fill, clocks, accounts, scans."""
     from mlbatch.bounded import MOST_BYTES
-    from mlbatch.cli.options import is_stdout
+    from mlbatch.cli.parameters import is_stdout
     from mlbatch.errors import UsageError, one_line
     from mlbatch.page import check_page, find_source, source_of_text, write_page
     from mlbatch.page.document import page_text

@@ -9,11 +9,12 @@ from operator import index
 from pathlib import Path
 from typing import TYPE_CHECKING, SupportsIndex
 
-from mlbatch.batching.windows import BATCHINGS, COMMON, TIMES, WINDOW, Limit
+from mlbatch.batching.windows import COMMON, WINDOW, Limit
 from mlbatch.discovery.discover import SensorSelection
 from mlbatch.errors import UsageError
+from mlbatch.options import BATCHING_TIMES, BATCHINGS, INSTANTS, SORTS
 from mlbatch.pipeline.segments import TimeSegment
-from mlbatch.types import EXTRAS, INSTANTS, RecordLayout
+from mlbatch.types import EXTRAS, RecordLayout
 from mlbatch.units import NS_PER_S
 
 if TYPE_CHECKING:
@@ -25,7 +26,6 @@ DEFAULT_MAX_WAIT_NS = NS_PER_S
 # Upper bound of any time, s: its nanoseconds fit into int64.
 MOST_S = 2**33
 MAX_SLICES = 10_000
-SORTS = ("columns", "points")
 
 
 @dataclass(frozen=True, slots=True)
@@ -169,7 +169,7 @@ def check_batching(job: Job) -> Job:
     """Return the job; UsageError for options that have no meaning for sets of sweeps."""
     for option, word, words in (
         ("--batching", job.batching, BATCHINGS),
-        ("--batching-times", job.batching_times, TIMES),
+        ("--batching-times", job.batching_times, BATCHING_TIMES),
     ):
         if word not in words:
             raise UsageError(

@@ -15,6 +15,7 @@ from typing import Any, Literal, TypeAlias, TypedDict, TypeVar
 
 from mlbatch.discovery.discover import SensorSelection
 from mlbatch.errors import UsageError
+from mlbatch.options import ALIGN_TO, CLOCKS, INSTANTS, LAYOUTS
 from mlbatch.pipeline.job import (
     Job,
     check_batching,
@@ -26,7 +27,6 @@ from mlbatch.pipeline.job import (
 )
 from mlbatch.pipeline.time_limits import limits_of
 from mlbatch.readers.inputs import expand
-from mlbatch.types import INSTANTS
 from mlbatch.units import parse_rate
 
 AnyPath: TypeAlias = "str | PathLike[str]"
@@ -109,7 +109,7 @@ class WindowOptions(TypedDict, total=False):
     split: bool
     keep_partial: bool
     drop_incomplete: float  # percent
-    max_wait: float
+    max_wait: float | str  # as on the command line: a number, or inf
     min_range: float
     max_range: float
     exclude_boxes: Iterable[Box]
@@ -187,10 +187,21 @@ def _names_of(tables: Iterable[type]) -> list[str]:
     return [name for table in tables for name in table.__annotations__]
 
 
-def session_job(recordings: Paths | tuple[Paths, ...], options: SessionOptions) -> Job:
-    """The options that select recordings and sensors; those of windows have their defaults."""
-    clock = choice("clock", options.get("clock", "sensor"), ("sensor", "host"))
-    align_to = choice("align_to", options.get("align_to", "host"), ("host", "first"))
+def _as_in_python(name: str) -> str:
+    return name
+
+
+def session_job(
+    recordings: Paths | tuple[Paths, ...],
+    options: SessionOptions,
+    shown: Callable[[str], str] = _as_in_python,
+) -> Job:
+    """The options that select recordings and sensors; those of windows have their defaults.
+
+    shown: the name of an option in errors.
+    """
+    clock = choice(shown("clock"), options.get("clock", "sensor"), CLOCKS)
+    align_to = choice(shown("align_to"), options.get("align_to", "host"), ALIGN_TO)
     aligned = options.get("align_clocks", False)
     several = recordings if isinstance(recordings, tuple) else (recordings,)
     found = expand(path for one in several for path in paths_of("recording", one))
@@ -213,34 +224,35 @@ def session_job(recordings: Paths | tuple[Paths, ...], options: SessionOptions) 
     )
 
 
-def window_job(job: Job, options: RatedOptions) -> Job:
-    """A job with the options of windows and points."""
-    layout = choice("layout", options.get("layout", "dense"), ("dense", "organized"))
+def window_job(job: Job, options: RatedOptions, shown: Callable[[str], str] = _as_in_python) -> Job:
+    """A job with the options of windows and points; shown: the name of an option in errors."""
+    layout = choice(shown("layout"), options.get("layout", "dense"), LAYOUTS)
     rate = options.get("rate")
     deskew_to = options.get("deskew_to")
     low = options.get("min_range", 0.0)
     high = options.get("max_range", math.inf)
-    check_ranges_m("min_range", low, "max_range", high)
+    check_ranges_m(shown("min_range"), low, shown("max_range"), high)
     drop_incomplete = options.get("drop_incomplete", 0.0)
     if not 0 <= drop_incomplete <= 100:
         raise UsageError(
-            f"drop_incomplete: expected a share from 0 to 100 %, found {drop_incomplete:g}; "
-            "correct it"
+            f"{shown('drop_incomplete')}: expected a share from 0 to 100 %, found "
+            f"{drop_incomplete:g}; correct it"
         )
-    start, end, are_dates = limits_of("start", options.get("start"), "end", options.get("end"))
-    wait_s = options.get("max_wait", 1.0)
+    start, end, are_dates = limits_of(
+        shown("start"), options.get("start"), shown("end"), options.get("end")
+    )
     job = replace(
         job,
         # By the text of a float: 29.97 means 2997/100, not the nearest binary number.
         rate=None if rate is None else parse_rate(str(rate)),
-        slices=check_slices("slices", options.get("slices", 1)),
+        slices=check_slices(shown("slices"), options.get("slices", 1)),
         layout=layout,
-        sort=check_sort("sort", options.get("sort", "columns"), layout),
+        sort=check_sort(shown("sort"), options.get("sort", "columns"), layout),
         split=options.get("split", False),
         keep_partial=options.get("keep_partial", False),
         keep_repeated=options.get("keep_repeated", False),
         drop_incomplete=drop_incomplete,
-        max_wait_ns=wait_ns("max_wait", wait_s, wait_s),
+        max_wait_ns=read_wait_ns(shown("max_wait"), options.get("max_wait", 1.0)),
         start=start,
         end=end,
         limits_are_dates=are_dates,
@@ -250,9 +262,18 @@ def window_job(job: Job, options: RatedOptions) -> Job:
         batching=options.get("batching", "window"),
         batching_times=options.get("batching_times", "common"),
         deskew=str(path_of("deskew", options.get("deskew")) or ""),
-        deskew_to=choice("deskew_to", deskew_to or INSTANTS[0], INSTANTS),
+        deskew_to=choice(shown("deskew_to"), deskew_to or INSTANTS[0], INSTANTS),
     )
     return check_deskew(check_batching(job), deskew_to is not None)
+
+
+def read_wait_ns(option: str, given: float | str) -> int | None:
+    """`--max-wait`: seconds, or inf; None: infinite."""
+    try:
+        seconds = float(given)
+    except ValueError:
+        seconds = math.nan
+    return wait_ns(option, seconds, given)
 
 
 def _box(values: Box) -> tuple[float, ...]:

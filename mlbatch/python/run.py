@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from mlbatch.options import INSTANTS
 from mlbatch.pipeline import preflight
 from mlbatch.pipeline.files import Files
 from mlbatch.pipeline.job import Job, check_max_bag_s
@@ -23,7 +24,7 @@ from mlbatch.report.report import (
     summary_lines,
 )
 from mlbatch.report.scan_table import ScanStatistics
-from mlbatch.types import INSTANTS, RunInfo
+from mlbatch.types import RunInfo
 from mlbatch.writers import (
     ScanWriter,
     WriterOptions,

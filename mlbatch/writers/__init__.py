@@ -28,7 +28,6 @@ from mlbatch.writers.atomic import (
 )
 from mlbatch.writers.base import (
     NO_COMPRESSION,
-    PLY_STYLES,
     FilesWriter,
     ScanJob,
     ScanWriter,
@@ -50,7 +49,9 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
     from pathlib import Path
 
-    from mlbatch.types import RecordLayout, RunInfo
+    from mlbatch.options import PLY_STYLES
+from mlbatch.options import PLY_STYLES
+from mlbatch.types import RecordLayout, RunInfo
 
 __all__ = [
     "FILES_JSONL",

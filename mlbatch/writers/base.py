@@ -15,7 +15,6 @@ DEFAULT_POINT_LAYOUT = "standard"
 NO_COMPRESSION = "none"
 # Number of checksums of scans: sums of CRC-32 are modulo this.
 CHECKSUMS = 1 << 32
-PLY_STYLES = ("standard", "cloudcompare", "float")
 
 
 class WriterOptions(NamedTuple):
@@ -25,7 +24,7 @@ class WriterOptions(NamedTuple):
     overwrite: bool = False  # replace an existing output at the end
     split: bool = False  # one output stream per sensor instead of merged scans
     compression: str = NO_COMPRESSION  # none, lz4 or zstd[:level]
-    ply_style: str = PLY_STYLES[0]  # names and types of PLY properties
+    ply_style: str = "standard"  # names and types of PLY properties
     fsync: bool = True  # force the output to the disk before it gets its name
     max_bag_s: float = 0.0  # recorded time in a file of a ROS 2 bag, s; 0: all in one file
     files: FileSet | None = None  # those that this run is to make; None: all

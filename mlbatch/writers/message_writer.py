@@ -22,7 +22,6 @@ from mlbatch.ros.definitions import FIELD_CODES
 from mlbatch.ros.encoding import Wire
 from mlbatch.types import (
     IMU,
-    INSTANTS,
     ImuSamples,
     Message,
     RecordLayout,
@@ -287,7 +286,7 @@ class MessageWriter:
 
 def stamp_ns(scan: Scan) -> int:
     """Return the time of the message of a scan: an instant of its window, by `--stamp`."""
-    return instant_ns(scan.info.variant("stamp", INSTANTS[0]), scan.start_ns, scan.end_ns)
+    return instant_ns(scan.info.variant("stamp", "start"), scan.start_ns, scan.end_ns)
 
 
 class ChunkJob(ScanJob):

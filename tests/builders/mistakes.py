@@ -232,12 +232,12 @@ MISTAKES: dict[str, tuple[str, int, str]] = {
     "clock": (
         f"{FIX} --clock gps",
         2,
-        "--clock: expected sensor or host, found 'gps'; choose one of them",
+        "--clock: expected sensor or host, found 'gps'; choose one",
     ),
     "layout": (
         f"{FIX} --layout round",
         2,
-        "--layout: expected dense or organized, found 'round'; choose one of them",
+        "--layout: expected dense or organized, found 'round'; choose one",
     ),
     "organized ply": (
         f"{FIX} --format ply --layout organized",

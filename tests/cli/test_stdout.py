@@ -42,7 +42,7 @@ def test_no_other_path_may_be_it(
         words += ["-o", "out"]
     outcome = shell(command, *words)
     assert (outcome.code, outcome.out) == (2, "")
-    name = option.upper() if is_argument else {"--output": "-o"}.get(option, option)
+    name = option.upper() if is_argument else option
     assert outcome.err == (
         f"mlbatch: error: {name}: expected a path, found -: neither standard input nor standard "
         "output can be used here; give a file or folder\n"

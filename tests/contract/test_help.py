@@ -229,7 +229,7 @@ GROUPS = ("Input", "Batching", "Selection", "Output", "Clocks", "Run")
 def test_every_option_of_convert_is_in_a_group() -> None:
     page = CliRunner().invoke(command_line("convert"), ["convert", "-h"]).stdout
     assert tuple(re.findall(r"^(\w+):$", page, re.MULTILINE)) == GROUPS, (
-        "list the option in GROUPS of mlbatch/cli/help.py"
+        "list the option in _OTHERS of mlbatch/cli/help.py"
     )
 
 
@@ -290,13 +290,6 @@ def test_a_shell_completes_words_of_options() -> None:
             "main()\n"
         )
         assert words <= set(printed.split()), option
-
-
-def test_words_of_options_are_those_of_a_job() -> None:
-    from mlbatch.cli import convert
-    from mlbatch.pipeline import job
-
-    assert convert.SORTS == job.SORTS
 
 
 def test_help_loads_nothing_heavy() -> None:

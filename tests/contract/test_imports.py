@@ -25,7 +25,7 @@ FLOORS: tuple[tuple[str, ...], ...] = (
     ("lidar", "frames", "ros"),
     ("types",),
     ("native",),
-    ("arrays", "units", "entry_points"),
+    ("arrays", "units", "entry_points", "options"),
     # "": the package itself, with its version; it loads the rest on demand.
     ("errors", "bounded", ""),
 )
@@ -107,7 +107,7 @@ def test_no_module_is_private() -> None:
     assert sorted(found) == []
 
 
-def test_the_root_has_eight_modules() -> None:
+def test_the_root_has_nine_modules() -> None:
     found = {path.stem for path in PACKAGE.glob("*.py")}
-    base = {"types", "arrays", "units", "errors", "bounded"}
+    base = {"types", "arrays", "units", "errors", "bounded", "options"}
     assert found == {"__init__", "__main__", "api"} | base

@@ -10,12 +10,13 @@ from functools import lru_cache
 from pathlib import Path
 
 from mlbatch import sensors
-from mlbatch.cli import options
+from mlbatch.cli import values
 from mlbatch.discovery.match import ExpectedSensor, match_rig
 from mlbatch.discovery.sampler import Sampler
 from mlbatch.errors import MlbatchError
 from mlbatch.frames.urdf import joints
 from mlbatch.pipeline import time_limits
+from mlbatch.python.options import choice, read_wait_ns
 from mlbatch.rig.rig import Rig, read_rig
 from mlbatch.rig.write import write_rig
 from mlbatch.sensors.options import check_options
@@ -124,24 +125,24 @@ def _urdf(data: bytes, folder: Path) -> None:
 
 
 _TYPED: Sequence[tuple[Callable[[str], object], tuple[str, ...]]] = (
-    (options.rate, ("10", "29.97", "10/3", "1e1", "0.25")),
-    (options.box_m, ("-1,-1,0,1,1,2", "0,0,0,1,1,1", "-1e3,-1,0,1,1,2.5")),
-    (options.max_wait_ns, ("1.0", "inf", "0.05", "1e9")),
+    (values.rate, ("10", "29.97", "10/3", "1e1", "0.25")),
+    (values.box_m, ("-1,-1,0,1,1,2", "0,0,0,1,1,1", "-1e3,-1,0,1,1,2.5")),
+    (lambda text: read_wait_ns("--max-wait", text), ("1.0", "inf", "0.05", "1e9")),
     (lambda text: time_limits.time_limit("--start", text), ("+12.5", "1700000000.5", "-3")),
     (lambda text: time_limits.time_limit("--end", text), ("2026-05-01T12:00:00Z", "2026-05-01")),
-    (lambda text: options.decode_options(text.split(";")), ("crc=check", "firing_azimuth=off;a=b")),
+    (lambda text: values.decode_options(text.split(";")), ("crc=check", "firing_azimuth=off;a=b")),
     (
         lambda text: check_options(dict(pair.partition("=")[::2] for pair in text.split(";"))),
         ("packet_stamp=end", "crc=check;optical_centre=on"),
     ),
     (
-        lambda text: options.faults(text.split(" ")),
+        lambda text: values.faults(text.split(" ")),
         (
             *("drop:left:5%", "stall:left:5s-8s", "delay:left:60ms", "jump:left:37s@10s"),
             *("dup:left:1%", "reorder", "bitflip:*:0.1%", "drift:left:50ppm", "late:left:3s"),
         ),
     ),
-    (lambda text: options.choice("--layout", text, ("dense", "organized")), ("dense",)),
+    (lambda text: choice("--layout", text, ("dense", "organized")), ("dense",)),
 )
 
 

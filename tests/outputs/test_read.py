@@ -13,10 +13,10 @@ from hypothesis import strategies as st
 import mlbatch
 from mlbatch.arrays import I64Array
 from mlbatch.errors import RecordingError, UsageError
+from mlbatch.options import PLY_STYLES
 from mlbatch.outputs.clouds import CloudPlace, scan_of_cloud
 from mlbatch.outputs.scan import Scan
 from mlbatch.python.recording import Recording
-from mlbatch.writers.base import PLY_STYLES
 from mlbatch.writers.point_layouts import CLOUD_LAYOUTS
 from tests.builders.scans import run_info
 from tests.contract.tree import ROOT

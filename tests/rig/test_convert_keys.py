@@ -32,7 +32,7 @@ def test_every_option_of_convert_is_a_key() -> None:
     options = set(OPTIONS["convert"]) - NOT_IN_A_RIG - ALIASES
     # Ignored with a note, and hidden.
     keys = {f"--{key.name.replace('_', '-')}" for key in CONVERT} - {"--engine"}
-    assert keys == options, "list new options in mlbatch/rig/convert_keys.py, or NOT_IN_A_RIG here"
+    assert keys == options, "set in_rig in mlbatch/options.py, or list it in NOT_IN_A_RIG here"
 
 
 def test_options_are_read_as_on_the_command_line(tmp_path: Path) -> None:
@@ -88,7 +88,10 @@ def test_a_written_trajectory_is_relative_to_the_new_rig_file(tmp_path: Path) ->
 @pytest.mark.parametrize(
     ("section", "message"),
     [
-        ("convert:\n  job: 4\n", ":3: convert.job: expected a key of format, layout, "),
+        (
+            "convert:\n  job: 4\n",
+            ":3: convert.job: expected a key of decode, identity_extrinsics, ",
+        ),
         ("convert:\n  job: 4\n", ", found 'job'; the nearest known key is jobs"),
         ("convert: {rate: 20}\n", "found 'rate'; the nearest known key is "),
         ("convert: 4\n", ":2: convert: expected a mapping with keys of "),
@@ -104,9 +107,9 @@ def test_a_written_trajectory_is_relative_to_the_new_rig_file(tmp_path: Path) ->
         ),
         (
             "convert: {drop_incomplete: 101}\n",
-            ":2: convert.drop_incomplete: expected a share from 0 to 100 %, found '101'; ",
+            ":2: convert.drop_incomplete: expected a number from 0 to 100, found '101'; ",
         ),
-        ("convert: {min_range: -1}\n", ":2: convert.min_range: expected a range of 0 m or more, "),
+        ("convert: {min_range: -1}\n", ":2: convert.min_range: expected a number 0 or more, "),
         ("convert: {only: {a: b}}\n", ":2: convert.only: expected text, or a list of texts, "),
         ("convert: {decode: crc}\n", ":2: convert.decode: expected a mapping of options, "),
         ("convert: {format: }\n", ":2: convert.format: expected text, found nothing; "),

@@ -1,0 +1,168 @@
+"""Option values from text, and the job and target that they make."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from fractions import Fraction
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, cast
+
+from mlbatch.cli.parameters import is_stdout
+from mlbatch.cli.run import Target
+from mlbatch.errors import UsageError
+from mlbatch.options import INSTANTS
+from mlbatch.pipeline.job import Job, check_max_bag_s
+from mlbatch.python.options import RatedOptions, SessionOptions, choice, session_job, window_job
+from mlbatch.report.limits import parse_limits
+from mlbatch.sensors import DECODE_OPTIONS
+from mlbatch.units import parse_rate
+from mlbatch.writers import parse_jobs
+
+if TYPE_CHECKING:
+    from mlbatch.faults import Fault
+    from mlbatch.pipeline.shards import Shard
+
+
+# Options whose values need no text to be read, by the tables of Python.
+_SESSION = ("rig", "identity_extrinsics", "clock", "align_clocks", "align_to", "strict")
+_SESSION_LISTS = ("metadata", "only", "ignore")
+_WINDOWS = (
+    *("start", "end", "slices", "layout", "sort", "split", "keep_partial", "keep_repeated"),
+    *("drop_incomplete", "max_wait", "min_range", "max_range", "batching", "batching_times"),
+    "deskew_to",
+)
+
+
+def job_of(recordings: Sequence[Path], values: Mapping[str, Any]) -> Job:
+    """The job of a conversion, from the values of its options."""
+    session: dict[str, Any] = {name: values[name] for name in _SESSION}
+    session |= {name: tuple(values[name] or ()) for name in _SESSION_LISTS}
+    session["decode"] = decode_options(values["decode"] or ())
+    windows: dict[str, Any] = {name: values[name] for name in _WINDOWS}
+    windows["rate"] = None if values["rate"] is None else rate(values["rate"])
+    windows["deskew"] = values["deskew"] or None
+    windows["exclude_boxes"] = tuple(box_m(text) for text in values["exclude_box"] or ())
+    job = session_job(tuple(recordings), cast(SessionOptions, session), long_name)
+    job = window_job(job, cast(RatedOptions, windows), long_name)
+    return replace(
+        job,
+        stamp=choice("--stamp", values["stamp"], INSTANTS),
+        faults=faults(values["fault"] or ()),
+        fault_seed=seed(values["fault_seed"]),
+        passed=tuple(values["pass_"] or ()),
+        max_bag_s=check_max_bag_s("--max-bag-duration", values["max_bag_duration"]),
+        shard=shard(values["shard"]),
+    )
+
+
+def target_of(values: Mapping[str, Any]) -> Target:
+    """Where the result of a conversion goes, from the values of its options."""
+    on_jump = choice("--on-jump", values["on_jump"], ("error", "split"))
+    output(values["output"], dry_run=values["dry_run"])
+    report = values["report"]
+    names = (
+        *("output", "format", "point_layout", "compression", "ply_style", "dry_run", "html"),
+        *("overwrite", "quiet", "verbose"),
+    )
+    return Target(
+        **{name: values[name] for name in names},
+        jobs=parse_jobs("--jobs", values["jobs"]),
+        report=None if is_stdout(report) else report,
+        prints_report=is_stdout(report),
+        split_jumps=on_jump == "split",
+        limits=parse_limits(values["fail_on"] or ()),
+        resume=resume(values["resume"], dry_run=values["dry_run"]),
+        fsync=not values["no_fsync"],
+    )
+
+
+def long_name(name: str) -> str:
+    """An option as typed."""
+    return f"--{name.replace('_', '-')}"
+
+
+def rate(text: str) -> Fraction:
+    """`--rate`, exactly the number in the text."""
+    try:
+        return parse_rate(text)
+    except UsageError as err:
+        raise UsageError(f"--{err}") from err
+
+
+def box_m(text: str) -> tuple[float, ...]:
+    """`--exclude-box x0,y0,z0,x1,y1,z1`, metres in the body frame."""
+    try:
+        values = tuple(float(part) for part in text.split(","))
+    except ValueError:
+        values = ()
+    ordered = len(values) == 6 and all(a < b for a, b in zip(values[:3], values[3:], strict=True))
+    if not ordered:
+        raise UsageError(
+            f"--exclude-box: expected x0,y0,z0,x1,y1,z1 in metres with x0 < x1, y0 < y1, z0 < z1, "
+            f"found {text!r}; write --exclude-box=-1,-1,0,1,1,2"
+        )
+    return values
+
+
+def decode_options(texts: Sequence[str]) -> dict[str, str]:
+    """`--decode KEY=VALUE`, repeatable."""
+    options = {}
+    for text in texts:
+        key, sign, value = text.partition("=")
+        if key not in DECODE_OPTIONS:
+            raise UsageError(
+                f"--decode: expected one of {', '.join(DECODE_OPTIONS)}, found {key!r}; "
+                "write --decode crc=check"
+            )
+        if not sign or value not in DECODE_OPTIONS[key]:
+            raise UsageError(
+                f"--decode {key}: expected {' or '.join(DECODE_OPTIONS[key])}, found {value!r}; "
+                f"write --decode {key}={DECODE_OPTIONS[key][0]}"
+            )
+        options[key] = value
+    return options
+
+
+def faults(texts: Sequence[str]) -> tuple[Fault, ...]:
+    """`--fault KIND:SENSOR:VALUE`, repeatable."""
+    if not texts:
+        return ()
+    # Not loaded for runs without faults.
+    from mlbatch.faults import parse_fault
+
+    return tuple(parse_fault(text) for text in texts)
+
+
+def shard(text: str | None) -> Shard | None:
+    """`--shard K/N`."""
+    if text is None:
+        return None
+    # Not loaded for runs without shards.
+    from mlbatch.pipeline.shards import parse_shard
+
+    return parse_shard(text)
+
+
+def seed(number: int) -> int:
+    """`--fault-seed`, a whole number from 0."""
+    if number < 0:
+        raise UsageError(
+            f"--fault-seed: expected a whole number from 0, found {number}; correct it"
+        )
+    return number
+
+
+def output(path: Path | None, *, dry_run: bool) -> None:
+    """`-o`, required unless it is a dry run."""
+    if path is None and not dry_run:
+        raise UsageError("-o: expected an output, found none; give -o scans.mcap, or --dry-run")
+
+
+def resume(resume: bool, *, dry_run: bool) -> bool:
+    """`--resume`, which a dry run cannot have: it leaves no output."""
+    if resume and dry_run:
+        raise UsageError(
+            "--resume: expected an output to continue, found --dry-run; give one of them"
+        )
+    return resume
