@@ -32,9 +32,9 @@ from typing import Any, NoReturn
 
 from mlbatch.cli import main as mlbatch
 from mlbatch.pipeline.run import _Output
+from mlbatch.simulate.ouster.encode import OusterSpec
 from tests.builders.bags import Body, Recorded, imu_message, packet_message
 from tests.builders.captures import write_pcap
-from tests.builders.ouster import OusterSpec
 from tests.builders.sessions import NS_PER_MS, NS_PER_S, Unit, twin, write_metadata
 from tests.builders.sessions_of_bags import write_mcap
 

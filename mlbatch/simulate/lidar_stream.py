@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from mlbatch.arrays import F64Array, I64Array
-from mlbatch.lidar.simulated import Sent, Shots
+from mlbatch.simulate.interface import Sent, Shots
 from mlbatch.simulate.models import simulated_lidar
 from mlbatch.simulate.scenario import Clock, ImuErrors, LidarPlan, Scenario
 from mlbatch.simulate.scene import Rays, Scene

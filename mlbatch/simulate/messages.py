@@ -10,8 +10,8 @@ from dataclasses import dataclass
 
 from mlbatch.arrays import F64Array
 from mlbatch.frames.transforms import quaternion
-from mlbatch.lidar.simulated import PacketTopic
 from mlbatch.ros.encoding import Cdr
+from mlbatch.simulate.interface import PacketTopic
 from mlbatch.simulate.trajectory import Poses
 from mlbatch.units import NS_PER_S
 

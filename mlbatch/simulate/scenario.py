@@ -18,10 +18,10 @@ import numpy as np
 from mlbatch.arrays import F64Array
 from mlbatch.errors import RigError
 from mlbatch.frames.transforms import from_rpy_deg
-from mlbatch.lidar.simulated import LidarModel, LidarSettings
 from mlbatch.rig.rig import MAX_NAME
 from mlbatch.rig.yaml_tree import Node, read_yaml
 from mlbatch.simulate.forest import Forest, grown
+from mlbatch.simulate.interface import LidarModel, LidarSettings
 from mlbatch.simulate.models import lidar_models
 from mlbatch.simulate.scene import Boxes, Rectangles, Scene, Stems
 from mlbatch.simulate.terrain import Terrain, rough_terrain

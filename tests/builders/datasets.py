@@ -13,12 +13,12 @@ from typing import Any
 
 import numpy as np
 
+from mlbatch.simulate.velodyne.encode import VelodyneSpec
 from tests.builders.bags import Body, Recorded, transforms_message
 from tests.builders.points import CLOUD, CUSTOM, Form, cloud_message, custom_message
 from tests.builders.rosbag1 import write_rosbag1
 from tests.builders.rosbag2 import write_folder
 from tests.builders.sweeps import pcd, raw, write_sweeps
-from tests.builders.velodyne import VelodyneSpec
 from tests.builders.vendor_sessions import velodyne_payloads
 
 MS = 1_000_000

@@ -17,9 +17,12 @@ from pathlib import Path
 import numpy as np
 
 from mlbatch.arrays import F64Array
-from tests.builders import hesai, robosense, two_lidars, velodyne
+from mlbatch.simulate.hesai import encode as hesai
+from mlbatch.simulate.hesai.angles import Angles, angles_csv
+from mlbatch.simulate.robosense import encode as robosense
+from mlbatch.simulate.velodyne import encode as velodyne
+from tests.builders import two_lidars
 from tests.builders.captures import udp_frame, write_pcap
-from tests.builders.hesai_angles import Angles, angles_csv
 from tests.builders.scene import hall
 from tests.builders.seen import (
     Eye,

@@ -13,7 +13,7 @@ from mlbatch.lidar.content_keys import content_keys
 from mlbatch.lidar.headers import Headers
 from mlbatch.lidar.interface import Lidar
 from mlbatch.sensors.ouster.sensor import read_calibration
-from tests.builders.ouster import OusterSpec, encode_packets, metadata_json
+from mlbatch.simulate.ouster.encode import OusterSpec, encode_packets, metadata_json
 from tests.reference.headers import read
 
 

@@ -16,8 +16,8 @@ from pathlib import Path
 
 import numpy as np
 
+from mlbatch.simulate.ouster.encode import OusterSpec, encode_packets, metadata_json
 from tests.builders.captures import udp_frame, write_pcap
-from tests.builders.ouster import OusterSpec, encode_packets, metadata_json
 
 NS_PER_S = 10**9
 NS_PER_MS = 10**6

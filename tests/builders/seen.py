@@ -12,8 +12,11 @@ from typing import TypeAlias
 import numpy as np
 
 from mlbatch.arrays import F64Array, I64Array
-from tests.builders import hesai, robosense, two_lidars, velodyne
-from tests.builders.hesai_angles import Beams
+from mlbatch.simulate.hesai import encode as hesai
+from mlbatch.simulate.hesai.angles import Beams
+from mlbatch.simulate.robosense import encode as robosense
+from mlbatch.simulate.velodyne import encode as velodyne
+from tests.builders import two_lidars
 from tests.builders.scene import Scene
 
 # Receive time in ns, and payload.

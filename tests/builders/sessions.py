@@ -17,9 +17,9 @@ import numpy.typing as npt
 import pytest
 
 from mlbatch.cli import app, main
+from mlbatch.simulate.ouster.encode import OusterSpec, encode_frame, imu_packet, metadata_json
 from mlbatch.writers import atomic
 from tests.builders.captures import udp_frame, write_pcap
-from tests.builders.ouster import OusterSpec, encode_frame, imu_packet, metadata_json
 from tests.builders.parser import parser
 
 REPOSITORY = Path(__file__).resolve().parents[2]

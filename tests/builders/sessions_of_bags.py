@@ -16,6 +16,7 @@ from pathlib import Path
 import zstandard
 from mcap.writer import CompressionType, Writer
 
+from mlbatch.simulate.ouster.encode import metadata_json
 from tests.builders.bags import (
     OUSTER_ROS1,
     Body,
@@ -26,7 +27,6 @@ from tests.builders.bags import (
     packet_message,
 )
 from tests.builders.captures import Packet, Section, write_pcapng
-from tests.builders.ouster import metadata_json
 from tests.builders.rosbag1 import write_rosbag1
 from tests.builders.rosbag2 import Form, write_folder, write_rosbag2
 from tests.builders.run import TWO_LIDARS

@@ -12,10 +12,10 @@ from mlbatch.lidar.geometry import read_rotor_words
 from mlbatch.lidar.interface import Evidence
 from mlbatch.sensors.velodyne import sensor as velodyne
 from mlbatch.sensors.velodyne.packets import VelodyneLidar
+from mlbatch.simulate.velodyne.encode import Sent, VelodyneSpec, encode
+from mlbatch.simulate.velodyne.models import calibration_yaml
 from mlbatch.types import Stream
 from tests.builders.decoded import readings
-from tests.builders.velodyne import Sent, VelodyneSpec, encode
-from tests.builders.velodyne_tables import calibration_yaml
 
 PLAIN = ("VLP-16", "Puck Hi-Res", "HDL-32E", "VLP-32C", "VLS-128")
 MODES = ("strongest", "last", "dual")

@@ -9,10 +9,13 @@ from pathlib import Path
 
 import numpy as np
 
-from tests.builders import hesai, livox, robosense, velodyne
+from mlbatch.simulate.hesai import encode as hesai
+from mlbatch.simulate.hesai.angles import angles_csv
+from mlbatch.simulate.robosense import encode as robosense
+from mlbatch.simulate.velodyne import encode as velodyne
+from tests.builders import livox
 from tests.builders.bags import Body, Recorded
 from tests.builders.captures import udp_frame, write_pcap
-from tests.builders.hesai_angles import angles_csv
 from tests.builders.sessions import Records, Unit
 
 # 800 s past the full hour.

@@ -9,9 +9,9 @@ from pathlib import Path
 
 import pytest
 
+from mlbatch.simulate.ouster.encode import metadata_json
 from tests.builders.bag_mistakes import BAG_MISTAKES
 from tests.builders.bags import Body, Recorded, transforms_message
-from tests.builders.ouster import metadata_json
 from tests.builders.points import XYZ, cloud_message
 from tests.builders.rosbag1 import write_rosbag1
 from tests.builders.rosbag2 import write_folder, write_rosbag2

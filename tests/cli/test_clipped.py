@@ -11,11 +11,11 @@ from mcap.reader import make_reader
 
 from mlbatch.outputs.cloud_messages import read_cloud
 from mlbatch.outputs.encoding import MessageCursor
+from mlbatch.simulate.ouster.encode import IntLike, OusterSpec, encode_packets
 from mlbatch.types import Scan
 from mlbatch.writers.message_writer import CloudMessage
 from mlbatch.writers.point_layouts import CLOUD_LAYOUTS, clipped_points
 from tests.builders.captures import udp_frame, write_pcap
-from tests.builders.ouster import IntLike, OusterSpec, encode_packets
 from tests.builders.points import OUSTER, STAMP_NS, cloud_message, write_points
 from tests.builders.scans import dense_scan
 from tests.builders.sessions import (

@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 from mcap.reader import make_reader
 
+from mlbatch.simulate.ouster.encode import OusterSpec
 from tests.builders.bags import Body, Recorded
-from tests.builders.ouster import OusterSpec
 from tests.builders.sessions import (
     NO_RECORDINGS,
     NS_PER_MS,

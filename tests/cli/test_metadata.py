@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from mlbatch.simulate.ouster.encode import OusterSpec, encode_frame
 from tests.builders.captures import udp_frame
-from tests.builders.ouster import OusterSpec, encode_frame
 from tests.builders.sessions import (
     EPOCH_NS,
     NS_PER_MS,

@@ -8,17 +8,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from mlbatch.simulate.hesai.angles import angles_csv, fan
+from mlbatch.simulate.hesai.encode import DUAL, HesaiSpec
+from mlbatch.simulate.robosense.encode import RobosenseSpec
+from mlbatch.simulate.velodyne.encode import VelodyneSpec, position_packets
+from mlbatch.simulate.velodyne.models import calibration_yaml
 from tests.builders.bags import Recorded
-from tests.builders.hesai import DUAL, HesaiSpec
-from tests.builders.hesai_angles import angles_csv, fan
 from tests.builders.livox import LivoxSpec
 from tests.builders.others import EE, filled
 from tests.builders.points import CLOUD, OUSTER, cloud_message
-from tests.builders.robosense import RobosenseSpec
 from tests.builders.rosbag2 import write_rosbag2
 from tests.builders.sessions import NS_PER_S, Report, Shell, report_of, write_metadata
-from tests.builders.velodyne import VelodyneSpec, position_packets
-from tests.builders.velodyne_tables import calibration_yaml
 from tests.builders.vendor_mistakes import RIGS, VENDOR_MISTAKES
 from tests.builders.vendor_sessions import (
     BEGIN_NS,

@@ -31,7 +31,7 @@ FLOORS: tuple[tuple[str, ...], ...] = (
 )
 FLOOR = {name: number for number, names in enumerate(FLOORS) for name in names}
 # A module in the folder of a vendor.
-VENDOR = re.compile(r"sensors\.\w+\.(?=\w)")
+VENDOR = re.compile(r"sensors\.(\w+)\.(?=\w)")
 MODULES = modules()
 NAMES = frozenset(module.name for module in MODULES)
 
@@ -93,11 +93,12 @@ def test_nobody_names_a_plugin(module: Module) -> None:
 
 @pytest.mark.parametrize("module", MODULES, ids=lambda module: module.name or "mlbatch")
 def test_vendors_know_nothing_of_each_other(module: Module) -> None:
-    """Modules of a vendor's folder are imported by that folder alone."""
+    """Modules of a vendor's folder are imported by that folder and the vendor's simulator alone."""
     for found in imports(module, NAMES):
         vendor = VENDOR.match(found.target)
         if vendor is not None:
-            assert module.name.startswith(vendor[0]), f"{module.path}:{found.line}: {found.target}"
+            folders = vendor[0], f"simulate.{vendor[1]}."
+            assert module.name.startswith(folders), f"{module.path}:{found.line}: {found.target}"
 
 
 def test_no_module_is_private() -> None:

@@ -30,9 +30,13 @@ from mlbatch.lidar.interface import (
     SensorModel,
 )
 from mlbatch.sensors import Plugin, built_in, models, parse_calibration, plugins
+from mlbatch.simulate.hesai import models as hesai_models
+from mlbatch.simulate.ouster import encode as ouster
+from mlbatch.simulate.robosense import models as robosense_models
+from mlbatch.simulate.velodyne import models as velodyne_tables
 from mlbatch.types import Stream
 from mlbatch.units import NS_PER_S
-from tests.builders import hesai_models, livox, ouster, points, robosense_models, velodyne_tables
+from tests.builders import livox, points
 from tests.builders.decoded import readings
 from tests.builders.others import rows
 from tests.golden.test_every_model import CASES, ROBOSENSE_NAMES, Sent
@@ -162,7 +166,7 @@ def test_every_model_has_an_encoder_and_a_case(model: SensorModel) -> None:
     # Models whose packets look like those of another one are encoded as that one.
     twins = {words[2]: words[0] for _, words in CASES if len(words) > 2}
     row = twins.get(model.name, model.same_packets_as or model.name)
-    assert row in encoded(), f"{model.name}: no row in tests/builders; {ADVICE}"
+    assert row in encoded(), f"{model.name}: no row in mlbatch/simulate; {ADVICE}"
     named = {VARIANTS.get(words[0], words[0]) for _, words in CASES}
     missing = f"{model.name}: no case in tests/golden/test_every_model.py; {ADVICE}"
     assert row in named, missing

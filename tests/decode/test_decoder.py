@@ -19,8 +19,8 @@ from mlbatch.frames.transforms import from_rpy_deg
 from mlbatch.native.arena import PacketArena
 from mlbatch.pipeline.sensor import new_ring
 from mlbatch.sensors import read_calibration
+from mlbatch.simulate.ouster.encode import IntLike, OusterSpec, encode_packets
 from mlbatch.types import RunInfo, Scan, SensorInfo
-from tests.builders.ouster import IntLike, OusterSpec, encode_packets
 from tests.builders.sessions import write_metadata
 
 START_NS = 1_800_000_000_100_000_000

@@ -34,6 +34,7 @@ from mlbatch.pipeline.conversion import Conversion
 from mlbatch.pipeline.sensor import new_ring
 from mlbatch.sensors.ouster.profiles import PROFILES
 from mlbatch.sensors.ouster.sensor import read_calibration
+from mlbatch.simulate.ouster.encode import OusterSpec, metadata_json
 from mlbatch.types import EXTRAS, RecordLayout, RunInfo, SensorInfo
 from mlbatch.writers.las_encoder import RECORD as LAS
 from mlbatch.writers.point_layouts import (
@@ -44,7 +45,6 @@ from mlbatch.writers.point_layouts import (
     ROWS_TIME,
 )
 from tests.builders.engines import BOXES_M, MOST_COLUMNS, Pair, assert_same
-from tests.builders.ouster import OusterSpec, metadata_json
 from tests.contract.tree import PACKAGE
 from tests.golden import test_every_model as models
 from tests.reference.decoder import readings_of, record_of

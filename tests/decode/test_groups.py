@@ -13,8 +13,8 @@ from mlbatch.decode.decoder import Decoder, ScanHeader, Source, WindowColumns
 from mlbatch.frames.transforms import from_rpy_deg
 from mlbatch.native.arena import PacketArena
 from mlbatch.pipeline.sensor import new_ring
+from mlbatch.simulate.velodyne.encode import VelodyneSpec
 from mlbatch.types import RunInfo, Scan, SensorInfo
-from tests.builders.velodyne import VelodyneSpec
 from tests.builders.velodyne_streams import Seen, made_of
 
 _POSES = (np.eye(4), from_rpy_deg((0, 0.8, 1.6), (0, 0, 60)), from_rpy_deg((-1, 0, 2), (3, 9, 180)))

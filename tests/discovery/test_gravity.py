@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from mlbatch.simulate.ouster.encode import imu_packet
 from tests.builders.captures import udp_frame
-from tests.builders.ouster import imu_packet
 from tests.builders.sessions import NS_PER_MS, Shell, Unit, report_of, write_session
 
 G = 9.80665

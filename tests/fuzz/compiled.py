@@ -30,6 +30,8 @@ from mlbatch.readers.capture.dissector import Dissector
 from mlbatch.readers.capture.frames import Frames
 from mlbatch.ros.point_packets import CloudError, Layout, Points, layout_of, pack
 from mlbatch.ros.point_rows import Rows, take_rows
+from mlbatch.simulate.ouster.encode import OusterSpec
+from mlbatch.simulate.velodyne.encode import VelodyneSpec
 from mlbatch.types import (
     EXTRAS,
     CaptureCounts,
@@ -42,8 +44,6 @@ from mlbatch.types import (
 from tests.builders.captures import udp_frame
 from tests.builders.engines import BOXES_M, Pair
 from tests.builders.headers import check_headers, ouster_packets
-from tests.builders.ouster import OusterSpec
-from tests.builders.velodyne import VelodyneSpec
 from tests.builders.velodyne_streams import PLAIN, made_of
 from tests.decode.test_engine import (
     END_NS,

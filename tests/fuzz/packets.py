@@ -16,7 +16,10 @@ from mlbatch import sensors
 from mlbatch.errors import MlbatchError
 from mlbatch.lidar.interface import Calibration, Evidence, ModelFile
 from mlbatch.sensors.ouster.profiles import PROFILES
-from tests.builders import ouster, robosense, velodyne
+from mlbatch.simulate.ouster import encode as ouster
+from mlbatch.simulate.robosense import encode as robosense
+from mlbatch.simulate.velodyne import encode as velodyne
+from mlbatch.simulate.velodyne.models import calibration_yaml
 from tests.builders.livox import (
     CARTESIAN16,
     CARTESIAN32,
@@ -27,7 +30,6 @@ from tests.builders.livox import (
     point_packets,
 )
 from tests.builders.others import livox1_packets
-from tests.builders.velodyne_tables import calibration_yaml
 from tests.builders.velodyne_xml import entries, xml_of
 from tests.builders.vendors import wrongly_excluded_file
 from tests.contract.tree import ROOT

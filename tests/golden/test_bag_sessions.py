@@ -15,8 +15,8 @@ import pytest
 from mcap.reader import make_reader
 
 from mlbatch.rig.rig import read_rig
+from mlbatch.simulate.ouster.encode import metadata_json
 from tests.builders.bags import Recorded, imu_message
-from tests.builders.ouster import metadata_json
 from tests.builders.rosbag1 import write_rosbag1
 from tests.builders.rosbag2 import Form, write_folder, write_rosbag2
 from tests.builders.run import TWO_LIDARS, Told, command, load, scan_files

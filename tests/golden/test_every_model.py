@@ -18,10 +18,16 @@ import pytest
 from mlbatch.arrays import F64Array, I64Array
 from mlbatch.discovery.discover import SensorSelection
 from mlbatch.pipeline.job import Job
+from mlbatch.simulate.hesai import encode as hesai
+from mlbatch.simulate.hesai import models as hesai_models
+from mlbatch.simulate.hesai.angles import Angles, Beams, MirrorAngles, angles_csv, fan
+from mlbatch.simulate.robosense import encode as robosense
+from mlbatch.simulate.robosense import models as robosense_models
+from mlbatch.simulate.velodyne import encode as velodyne
+from mlbatch.simulate.velodyne.models import MODELS as VELODYNES
+from mlbatch.simulate.velodyne.models import calibration_yaml
 from mlbatch.types import Scan
-from tests.builders import hesai, hesai_models, robosense, robosense_models, velodyne
 from tests.builders.captures import udp_frame, write_pcap
-from tests.builders.hesai_angles import Angles, Beams, MirrorAngles, angles_csv, fan
 from tests.builders.run import Result, in_memory
 from tests.builders.scene import hall
 from tests.builders.seen import (
@@ -35,8 +41,6 @@ from tests.builders.seen import (
     velodyne_sees,
 )
 from tests.builders.seen_points import Expected, pair_types, repeated
-from tests.builders.velodyne_tables import MODELS as VELODYNES
-from tests.builders.velodyne_tables import calibration_yaml
 
 PACKETS = 12
 SOURCE = "192.168.1.201"

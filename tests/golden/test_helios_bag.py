@@ -16,8 +16,7 @@ import pytest
 
 from mlbatch.discovery.discover import SensorSelection
 from mlbatch.pipeline.job import Job
-from tests.builders.bags import Recorded
-from tests.builders.robosense import (
+from mlbatch.simulate.robosense.encode import (
     Angles,
     RobosenseSpec,
     difop,
@@ -26,6 +25,7 @@ from tests.builders.robosense import (
     msop,
     origins,
 )
+from tests.builders.bags import Recorded
 from tests.builders.rosbag2 import Form, write_rosbag2
 from tests.builders.run import command, in_memory
 from tests.builders.sessions_of_bags import write_mcap

@@ -19,11 +19,15 @@ from mlbatch.arrays import BoolArray
 from mlbatch.discovery.match import best_fits, match
 from mlbatch.lidar.interface import Calibration, ModelFile
 from mlbatch.sensors import parse_calibration
-from tests.builders import hesai, hesai_models, robosense, robosense_models, velodyne
-from tests.builders.hesai_angles import MirrorAngles, angles_csv, fan
+from mlbatch.simulate.hesai import encode as hesai
+from mlbatch.simulate.hesai import models as hesai_models
+from mlbatch.simulate.hesai.angles import MirrorAngles, angles_csv, fan
+from mlbatch.simulate.robosense import encode as robosense
+from mlbatch.simulate.robosense import models as robosense_models
+from mlbatch.simulate.velodyne import encode as velodyne
+from mlbatch.simulate.velodyne.models import MODELS as VELODYNES
+from mlbatch.simulate.velodyne.models import calibration_yaml
 from tests.builders.loss import Came
-from tests.builders.velodyne_tables import MODELS as VELODYNES
-from tests.builders.velodyne_tables import calibration_yaml
 from tests.fuzz.decoding import sampled
 from tests.fuzz.framing import Part
 from tests.golden.test_every_model import hesai_modes

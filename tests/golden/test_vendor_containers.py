@@ -13,8 +13,9 @@ import pytest
 
 from mlbatch.discovery.discover import SensorSelection
 from mlbatch.pipeline.job import Job
-from tests.builders import hesai, velodyne
-from tests.builders.hesai_angles import angles_csv
+from mlbatch.simulate.hesai import encode as hesai
+from mlbatch.simulate.hesai.angles import angles_csv
+from mlbatch.simulate.velodyne import encode as velodyne
 from tests.builders.run import Values, buffers_of, in_memory, prints
 from tests.golden.vendor_messages import CONTAINERS, NS_PER_MS, Unit, unit_of
 

@@ -15,10 +15,10 @@ from mlbatch.arrays import U8Array
 from mlbatch.lidar import headers
 from mlbatch.lidar.interface import Lidar
 from mlbatch.sensors.ouster.profiles import FUSA, PROFILES, STANDARD
+from mlbatch.simulate.ouster.encode import OusterSpec
+from mlbatch.simulate.velodyne.encode import VelodyneSpec
 from tests.builders.engines import needs_native
 from tests.builders.headers import check_headers, ouster_packets
-from tests.builders.ouster import OusterSpec
-from tests.builders.velodyne import VelodyneSpec
 from tests.builders.velodyne_streams import MODES, PLAIN, made_of
 from tests.contract.test_models import cases
 

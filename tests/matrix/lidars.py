@@ -14,9 +14,11 @@ from pathlib import Path
 import numpy as np
 
 from mlbatch.arrays import I64Array
-from tests.builders import hesai, robosense, velodyne
-from tests.builders.hesai_angles import angles_csv
-from tests.builders.ouster import OusterSpec, encode_packets, metadata_json
+from mlbatch.simulate.hesai import encode as hesai
+from mlbatch.simulate.hesai.angles import angles_csv
+from mlbatch.simulate.ouster.encode import OusterSpec, encode_packets, metadata_json
+from mlbatch.simulate.robosense import encode as robosense
+from mlbatch.simulate.velodyne import encode as velodyne
 
 NS_PER_S = 10**9
 NS_PER_MS = 10**6

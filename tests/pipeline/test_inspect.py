@@ -14,6 +14,7 @@ import pytest
 import mlbatch
 from mlbatch.errors import RigError
 from mlbatch.rig.rig import read_rig
+from mlbatch.simulate.velodyne.encode import VelodyneSpec
 from tests.builders.captures import udp_frame
 from tests.builders.sessions import (
     FIXTURE,
@@ -29,7 +30,6 @@ from tests.builders.sessions import (
     write_metadata,
     write_session,
 )
-from tests.builders.velodyne import VelodyneSpec
 from tests.builders.vendor_sessions import framed, velodyne_payloads, write_capture
 
 CAPTURE = FIXTURE / "two_lidars.pcap"

@@ -14,9 +14,9 @@ import numpy as np
 import pytest
 
 from mlbatch.arrays import F64Array
+from mlbatch.simulate.velodyne.models import MODELS
 from tests.builders.run import Cloud
 from tests.builders.traffic import read_pcap
-from tests.builders.velodyne_tables import MODELS
 from tests.recordings.references import (
     HOUR_NS,
     US_NS,

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from mlbatch.arrays import BoolArray, F32Array, I64Array
-from tests.builders.velodyne_tables import MODELS
+from mlbatch.simulate.velodyne.models import MODELS
 from tests.recordings.references import (
     ONLY,
     STRONGEST_FIRST,

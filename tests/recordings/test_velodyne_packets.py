@@ -16,8 +16,8 @@ from mlbatch.lidar.interface import Evidence
 from mlbatch.readers import open_recording
 from mlbatch.sensors.velodyne import sensor as velodyne
 from mlbatch.sensors.velodyne.packets import VelodyneLidar
+from mlbatch.simulate.velodyne.encode import Sent
 from mlbatch.types import StreamTable
-from tests.builders.velodyne import Sent
 from tests.recordings import RECORDINGS
 
 FOLDER = RECORDINGS / "velodyne"

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from mlbatch.arrays import BoolArray, F64Array, I64Array
-from tests.builders.velodyne_tables import MODELS
+from mlbatch.simulate.velodyne.models import MODELS
 from tests.recordings import RECORDINGS
 from tests.recordings.references import Decoded
 

@@ -7,7 +7,7 @@ import pytest
 
 from mlbatch.sensors import content_keys
 from mlbatch.sensors.ouster.packets import unsigned
-from tests.builders.velodyne import VelodyneSpec
+from mlbatch.simulate.velodyne.encode import VelodyneSpec
 from tests.builders.velodyne_streams import made_of
 
 

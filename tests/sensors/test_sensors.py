@@ -13,13 +13,13 @@ from hypothesis import strategies as st
 from mlbatch import sensors
 from mlbatch.errors import RigError
 from mlbatch.sensors.ouster.profiles import PROFILES
+from mlbatch.simulate.ouster.encode import OusterSpec, encode_frame, imu_packet, metadata_json
 from tests.builders.others import (
     filled,
     livox2_packets,
     rows,
     velodyne_packets,
 )
-from tests.builders.ouster import OusterSpec, encode_frame, imu_packet, metadata_json
 from tests.builders.streams import named
 
 

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from mlbatch.arrays import I64Array
-from tests.builders.hesai import (
+from mlbatch.simulate.hesai.encode import (
     DUAL,
     TRIPLE,
     HesaiSpec,

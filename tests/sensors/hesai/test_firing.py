@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 
 from mlbatch.arrays import I64Array
-from mlbatch.sensors.hesai import encode_models, firing
+from mlbatch.sensors.hesai import firing
 from mlbatch.sensors.hesai.firing import HIGH, NEVER, OT128, SAVING, STANDARD
 from mlbatch.sensors.hesai.models import ALL, AZIMUTH_STATES, OPERATIONS
+from mlbatch.simulate.hesai import models as encoder
 from tests.reference import hesai as reference
 
 FAMILIES = {"Pandar128E3X": "128E3X", "OT128": "OT128"}
@@ -32,17 +33,17 @@ def test_modes_and_states_choose_the_table_of_the_document(name: str) -> None:
         np.testing.assert_array_equal(table, times, str(key))
 
 
-@pytest.mark.parametrize("name", encode_models.TABLES)
+@pytest.mark.parametrize("name", encoder.TABLES)
 def test_the_encoder_fires_as_the_document_says(name: str) -> None:
     wanted = reference.firing_ns(name.removesuffix("-7"))
-    np.testing.assert_array_equal(np.atleast_2d(encode_models.TABLES[name]), wanted)
+    np.testing.assert_array_equal(np.atleast_2d(encoder.TABLES[name]), wanted)
 
 
 @pytest.mark.parametrize("name", FAMILIES)
 def test_the_encoder_has_the_states_of_the_document(name: str) -> None:
     wanted = reference.by_state(FAMILIES[name])
-    for (mode, state), times in encode_models.STATES[name].items():
-        operation = encode_models.OPERATIONS[mode]
+    for (mode, state), times in encoder.STATES[name].items():
+        operation = encoder.OPERATIONS[mode]
         np.testing.assert_array_equal(times, wanted[operation, state], f"{mode} {state}")
 
 

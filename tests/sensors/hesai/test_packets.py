@@ -10,8 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from mlbatch.lidar.headers import DatedGroups, HeaderReader, checks
-from tests.builders.hesai import date_field
-from tests.builders.hesai_models import EPOCH, SINCE_1900
+from mlbatch.simulate.hesai.encode import date_field
+from mlbatch.simulate.hesai.models import EPOCH, SINCE_1900
 
 # One block of two bytes, then date and microseconds.
 _READER = HeaderReader(

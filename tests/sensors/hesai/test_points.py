@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from mlbatch.arrays import U8Array
-from tests.builders.hesai_angles import MirrorAngles, angles_csv, fan
+from mlbatch.simulate.hesai.angles import MirrorAngles, angles_csv, fan
 from tests.builders.hesai_decoded import decode, rows
 
 # 2023-06-15 12:30:45.678901 UTC; `date -u -d 2023-06-15T12:30:45 +%s` says 1686832245.

@@ -13,10 +13,10 @@ from mlbatch.errors import MlbatchError, RigError, UsageError
 from mlbatch.lidar.interface import FAULTS
 from mlbatch.sensors import crc
 from mlbatch.sensors.hesai import sensor as hesai
-from tests.builders import hesai as builder
+from mlbatch.simulate.hesai import encode as builder
+from mlbatch.simulate.hesai.angles import Angles, Beams, MirrorAngles, angles_csv, fan
+from mlbatch.simulate.hesai.encode import HesaiSpec, encode_packets
 from tests.builders.decoded import Rotor, projected
-from tests.builders.hesai import HesaiSpec, encode_packets
-from tests.builders.hesai_angles import Angles, Beams, MirrorAngles, angles_csv, fan
 from tests.builders.hesai_decoded import calibration, decode, evidence, rows
 
 COLUMNS = 420

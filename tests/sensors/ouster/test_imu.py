@@ -12,7 +12,7 @@ import pytest
 from mlbatch.arrays import U8Array
 from mlbatch.sensors.ouster.imu import read_legacy
 from mlbatch.sensors.ouster.sensor import OusterLidar, read_calibration
-from tests.builders.ouster import OusterSpec, imu_packet, metadata_json
+from mlbatch.simulate.ouster.encode import OusterSpec, imu_packet, metadata_json
 
 ACCEL32 = "ACCEL32_GYRO32_NMEA"
 

@@ -14,7 +14,7 @@ import pytest
 from mlbatch.errors import RigError, UsageError
 from mlbatch.sensors.ouster.metadata import Metadata
 from mlbatch.sensors.ouster.sensor import OusterCalibration, read_calibration
-from tests.builders.ouster import JsonObject, OusterSpec, flat_json, metadata_json
+from mlbatch.simulate.ouster.encode import JsonObject, OusterSpec, flat_json, metadata_json
 
 PATH = Path("front.json")
 SPEC = OusterSpec(beams=64, product="OS-1-64-AH", beam_offset_mm=(15.806, 0.0))

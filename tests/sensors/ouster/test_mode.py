@@ -13,9 +13,9 @@ from mlbatch.errors import RigError
 from mlbatch.lidar.interface import Evidence
 from mlbatch.sensors.ouster.mode import MODES
 from mlbatch.sensors.ouster.sensor import OusterCalibration, read_calibration
+from mlbatch.simulate.ouster.encode import OusterSpec, encode_packets, metadata_json
 from mlbatch.types import Stream
 from mlbatch.units import NS_PER_S
-from tests.builders.ouster import OusterSpec, encode_packets, metadata_json
 
 SPEC = OusterSpec(beams=16)
 PROFILES = ("RNG15_RFL8_NIR8", "LEGACY", "FUSA_RNG15_RFL8_NIR8_DUAL")

@@ -16,8 +16,8 @@ from mlbatch.arrays import U8Array
 from mlbatch.lidar.interface import Lidar
 from mlbatch.sensors.ouster.profiles import HEADER_TYPES, HEADERS, OFF, PROFILES, PacketLayout
 from mlbatch.sensors.ouster.sensor import OusterLidar, read_calibration
+from mlbatch.simulate.ouster.encode import IntLike, OusterSpec, encode_packets, metadata_json
 from tests.builders.decoded import readings
-from tests.builders.ouster import IntLike, OusterSpec, encode_packets, metadata_json
 from tests.reference import ouster as reference
 
 # One pixel a profile, worked by hand from the sheet. Words that occur again and again:

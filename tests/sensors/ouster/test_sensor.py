@@ -16,8 +16,8 @@ from mlbatch.sensors import describe
 from mlbatch.sensors.ouster import sensor as ouster
 from mlbatch.sensors.ouster.sensor import OusterCalibration
 from mlbatch.sensors.ouster.sensor import read_calibration as read_content
+from mlbatch.simulate.ouster.encode import OusterSpec, encode_packets, imu_packet, metadata_json
 from mlbatch.types import Stream
-from tests.builders.ouster import OusterSpec, encode_packets, imu_packet, metadata_json
 from tests.builders.streams import beside
 
 

@@ -14,11 +14,11 @@ from mlbatch.sensors import models
 from mlbatch.sensors.robosense import sensor as robosense
 from mlbatch.sensors.robosense.difop import Angles, find_difop
 from mlbatch.sensors.robosense.models import AIRY_96, BPEARL_V4, ROWS, RS16, RS32, Model
+from mlbatch.simulate.robosense.encode import RobosenseSpec, angles_csv, difop, fan, msop
+from mlbatch.simulate.robosense.models import DUAL, LAST, STRONGEST
 from mlbatch.types import Stream
 from tests.builders.others import filled, rows
-from tests.builders.robosense import RobosenseSpec, angles_csv, difop, fan, msop
 from tests.builders.robosense_decoded import DIFOP, built_in, decoded, evidence_of
-from tests.builders.robosense_models import DUAL, LAST, STRONGEST
 from tests.reference import robosense as reference
 
 MAGIC, TAIL = bytes.fromhex("a5ff005a11115555"), b"\x0f\xf0"

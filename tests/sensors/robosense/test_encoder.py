@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from mlbatch.arrays import I64Array
-from tests.builders.robosense import (
+from mlbatch.simulate.robosense.encode import (
     Angles,
     RobosenseSpec,
     azimuths_deg,
@@ -23,7 +23,7 @@ from tests.builders.robosense import (
     msop,
     origins,
 )
-from tests.builders.robosense_models import DUAL, LAST, MODELS, NEAREST, STRONGEST
+from mlbatch.simulate.robosense.models import DUAL, LAST, MODELS, NEAREST, STRONGEST
 
 # 2023-11-14 22:13:20 UTC; 1 700 000 000 s are 0x6553F100; 7 us, 12 ms and 999 ns after it.
 START_NS = 1_700_000_000_012_007_999

@@ -13,8 +13,7 @@ from mlbatch.arrays import F32Array, I64Array, U8Array
 from mlbatch.sensors.robosense import sensor as robosense
 from mlbatch.sensors.robosense.models import BPEARL_V3, BPEARL_V4
 from mlbatch.sensors.robosense.packets import times_ns
-from tests.builders.others import filled, robosense_packets, rows
-from tests.builders.robosense import (
+from mlbatch.simulate.robosense.encode import (
     Angles,
     RobosenseSpec,
     angles_csv,
@@ -26,8 +25,9 @@ from tests.builders.robosense import (
     msop,
     origins,
 )
+from mlbatch.simulate.robosense.models import AIRY_MOUNTS, DUAL, LAST, MODELS, NEAREST, STRONGEST
+from tests.builders.others import filled, robosense_packets, rows
 from tests.builders.robosense_decoded import Decoded, built_in, decoded, evidence_of
-from tests.builders.robosense_models import AIRY_MOUNTS, DUAL, LAST, MODELS, NEAREST, STRONGEST
 
 FIRST, SECOND = bytes.fromhex("55aa050a5aa550a0"), bytes.fromhex("55aa055a")
 

@@ -12,7 +12,7 @@ import pytest
 
 from mlbatch.errors import RigError
 from mlbatch.sensors.velodyne.calibration import MAX_BYTES, VelodyneFile, read_velodyne
-from tests.builders.velodyne_tables import MODELS, calibration_yaml
+from mlbatch.simulate.velodyne.models import MODELS, calibration_yaml
 from tests.builders.velodyne_xml import entries, xml_of
 
 PATH = Path("drive/unit.yaml")

@@ -17,8 +17,14 @@ from mlbatch.sensors.velodyne.clock import (
     rmc_ns,
     rotor_speed,
 )
+from mlbatch.simulate.velodyne.encode import (
+    Sent,
+    VelodyneSpec,
+    encode,
+    firing_times_ns,
+    position_packets,
+)
 from mlbatch.types import Stream
-from tests.builders.velodyne import Sent, VelodyneSpec, encode, firing_times_ns, position_packets
 
 STREAM, POSITIONS = Stream("192.168.1.201", 2368), Stream("192.168.1.201", 8308)
 SECOND_NS, HALF_NS = 1_000_000_000, HOUR_NS // 2

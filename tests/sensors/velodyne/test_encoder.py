@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from mlbatch.arrays import F64Array, U8Array
-from tests.builders.velodyne import (
+from mlbatch.simulate.velodyne.encode import (
     Rays,
     VelodyneSpec,
     directions,

@@ -13,8 +13,7 @@ from mlbatch.errors import RigError, UsageError
 from mlbatch.lidar.geometry import read_rotor_words
 from mlbatch.lidar.interface import FAULTS, NAMED_ONLY, Evidence, ModelFile
 from mlbatch.sensors.velodyne import sensor as velodyne
-from tests.builders.decoded import readings
-from tests.builders.velodyne import (
+from mlbatch.simulate.velodyne.encode import (
     Sent,
     VelodyneSpec,
     directions,
@@ -22,6 +21,8 @@ from tests.builders.velodyne import (
     firing_times_ns,
     origins,
 )
+from mlbatch.simulate.velodyne.models import MODELS, calibration_yaml
+from tests.builders.decoded import readings
 from tests.builders.velodyne_streams import (
     ANGLE_DEG,
     MODES,
@@ -36,7 +37,6 @@ from tests.builders.velodyne_streams import (
     pixels,
     pointing,
 )
-from tests.builders.velodyne_tables import MODELS, calibration_yaml
 
 
 @pytest.mark.parametrize("mode", MODES)

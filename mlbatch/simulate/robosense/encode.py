@@ -16,7 +16,7 @@ from datetime import datetime, timedelta, timezone
 import numpy as np
 
 from mlbatch.arrays import F64Array, I64Array, U8Array
-from mlbatch.sensors.robosense.encode_models import (
+from mlbatch.simulate.robosense.models import (
     AIRY_MOUNTS,
     DUAL,
     MODELS,

@@ -10,7 +10,7 @@ from dataclasses import replace
 import numpy as np
 
 from mlbatch.arrays import F64Array, I64Array
-from mlbatch.lidar.simulated import (
+from mlbatch.simulate.interface import (
     ImuUnit,
     LidarFiles,
     LidarModel,
@@ -20,7 +20,7 @@ from mlbatch.lidar.simulated import (
     Shots,
     whole_counts,
 )
-from mlbatch.sensors.robosense.encode import (
+from mlbatch.simulate.robosense.encode import (
     RobosenseSpec,
     advanced,
     difop,
@@ -30,7 +30,7 @@ from mlbatch.sensors.robosense.encode import (
     msop,
     origins,
 )
-from mlbatch.sensors.robosense.encode_models import MODELS as ROWS
+from mlbatch.simulate.robosense.models import MODELS as ROWS
 from mlbatch.units import NS_PER_S
 
 MSOP_PORT = 6699

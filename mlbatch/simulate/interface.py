@@ -1,7 +1,8 @@
 """The interface of a simulated lidar: rays of its shots, and packets of measured distances.
 
-The module `simulate` of a vendor offers it. Columns are sent in chunks of constant length, so that
-recordings of any length need constant memory; the number of a chunk determines its columns.
+The module `lidar` in the folder of a vendor offers it. Columns are sent in chunks of constant
+length, so that recordings of any length need constant memory; the number of a chunk determines its
+columns.
 """
 
 from __future__ import annotations
@@ -134,7 +135,7 @@ class SimulatedLidar(Protocol):
 
 
 class Simulator(Protocol):
-    """What the module `simulate` of a vendor offers."""
+    """What the module `lidar` of a vendor offers."""
 
     MODELS: tuple[LidarModel, ...]
 

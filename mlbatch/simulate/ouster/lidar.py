@@ -13,7 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from mlbatch.arrays import F64Array, I64Array
-from mlbatch.lidar.simulated import (
+from mlbatch.sensors.ouster.profiles import OFF, PROFILES
+from mlbatch.simulate.interface import (
     ImuUnit,
     LidarFiles,
     LidarModel,
@@ -23,14 +24,13 @@ from mlbatch.lidar.simulated import (
     Shots,
     whole_counts,
 )
-from mlbatch.sensors.ouster.encode import (
+from mlbatch.simulate.ouster.encode import (
     IntLike,
     OusterSpec,
     encode_packets,
     imu_packet,
     metadata_json,
 )
-from mlbatch.sensors.ouster.profiles import OFF, PROFILES
 from mlbatch.units import M_PER_MM, MM_PER_M, NS_PER_S, RAD_PER_DEG
 
 _COLUMNS_PER_PACKET = 16

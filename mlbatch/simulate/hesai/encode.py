@@ -1,8 +1,8 @@
 """Encoder of HESAI packets and angle files: what a lidar would send, from plain values.
 
 Source: docs/sources/hesai.md sections 2 (layout), 3 (tails), 4 (dates), 5 (times), 7 (checksums), 8
-(JT16); rows of the models: `hesai_models.py`, angles: `hesai_angles.py`. Column k is the k-th group
-of blocks that share an azimuth; the rotor has constant speed.
+(JT16); rows of the models: `models.py`, angles: `angles.py`. Column k is the k-th group of blocks
+that share an azimuth; the rotor has constant speed.
 """
 
 from __future__ import annotations
@@ -16,11 +16,11 @@ from datetime import datetime, timedelta
 import numpy as np
 
 from mlbatch.arrays import BoolArray, F64Array, I64Array, U8Array
-from mlbatch.sensors.hesai.encode_angles import Angles as Angles
-from mlbatch.sensors.hesai.encode_angles import Beams
-from mlbatch.sensors.hesai.encode_angles import MirrorAngles as MirrorAngles
-from mlbatch.sensors.hesai.encode_angles import angles_csv as angles_csv
-from mlbatch.sensors.hesai.encode_models import (
+from mlbatch.simulate.hesai.angles import Angles as Angles
+from mlbatch.simulate.hesai.angles import Beams
+from mlbatch.simulate.hesai.angles import MirrorAngles as MirrorAngles
+from mlbatch.simulate.hesai.angles import angles_csv as angles_csv
+from mlbatch.simulate.hesai.models import (
     EPOCH,
     HIGH,
     IMU,

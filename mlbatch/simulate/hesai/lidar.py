@@ -8,7 +8,18 @@ from __future__ import annotations
 import numpy as np
 
 from mlbatch.arrays import F64Array, I64Array
-from mlbatch.lidar.simulated import (
+from mlbatch.simulate.hesai.angles import Angles, Beams, MirrorAngles, angles_csv, fan
+from mlbatch.simulate.hesai.encode import (
+    HesaiSpec,
+    advanced,
+    directions,
+    encode_packets,
+    fires,
+    firing_times_ns,
+    packet_times_ns,
+)
+from mlbatch.simulate.hesai.models import MODELS as ROWS
+from mlbatch.simulate.interface import (
     ImuUnit,
     LidarFiles,
     LidarModel,
@@ -18,17 +29,6 @@ from mlbatch.lidar.simulated import (
     Shots,
     whole_counts,
 )
-from mlbatch.sensors.hesai.encode import (
-    HesaiSpec,
-    advanced,
-    directions,
-    encode_packets,
-    fires,
-    firing_times_ns,
-    packet_times_ns,
-)
-from mlbatch.sensors.hesai.encode_angles import Angles, Beams, MirrorAngles, angles_csv, fan
-from mlbatch.sensors.hesai.encode_models import MODELS as ROWS
 from mlbatch.units import NS_PER_S, RAD_PER_DEG
 
 DATA_PORT = 2368

@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 
 from mlbatch.arrays import F64Array, I64Array
-from mlbatch.lidar.simulated import (
+from mlbatch.simulate.interface import (
     ImuUnit,
     LidarFiles,
     LidarModel,
@@ -18,7 +18,7 @@ from mlbatch.lidar.simulated import (
     Shots,
     whole_counts,
 )
-from mlbatch.sensors.velodyne.encode import (
+from mlbatch.simulate.velodyne.encode import (
     VelodyneSpec,
     advanced,
     directions,
@@ -27,8 +27,8 @@ from mlbatch.sensors.velodyne.encode import (
     origins,
     position_packets,
 )
-from mlbatch.sensors.velodyne.encode_models import MODELS as TABLES
-from mlbatch.sensors.velodyne.encode_models import calibration_yaml
+from mlbatch.simulate.velodyne.models import MODELS as TABLES
+from mlbatch.simulate.velodyne.models import calibration_yaml
 from mlbatch.units import NS_PER_S, NS_PER_US
 
 DATA_PORT = 2368

@@ -15,7 +15,7 @@ from datetime import datetime, timedelta, timezone
 import numpy as np
 
 from mlbatch.arrays import F64Array, I64Array, U8Array
-from mlbatch.sensors.velodyne.encode_models import MODELS, Table
+from mlbatch.simulate.velodyne.models import MODELS, Table
 
 HOUR_US = 3_600_000_000
 NMEA_AT = 206

@@ -1,0 +1,1 @@
+"""Ouster lidars: packets from measured distances; `lidar.py` is the simulator."""

@@ -1,0 +1,1 @@
+"""ROBOSENSE lidars: packets from measured distances; `lidar.py` is the simulator."""
