@@ -12,13 +12,15 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from mlbatch.bounded import open_file, parse_json
+from mlbatch.bounded import parse_json
 from mlbatch.errors import RecordingError
+from mlbatch.outputs.cloud_messages import CLOUD, read_cloud
 from mlbatch.outputs.clouds import CloudPlace, Values, scan_of_cloud, scan_of_fields
 from mlbatch.outputs.commented import CommentedReader
 from mlbatch.outputs.damage import CheckLog, DamageError, VerifyError
 from mlbatch.outputs.float_rows import KITTI_SUFFIX, NUSCENES_SUFFIX, read_rows, start_of
-from mlbatch.outputs.folders import ScanFile, entries, refuse_shard, scan_files
+from mlbatch.outputs.folders import ScanFile, scan_files
+from mlbatch.outputs.kinds import kind_of
 from mlbatch.outputs.las import LasReader
 from mlbatch.outputs.npz import arrays_of
 from mlbatch.outputs.pcd import PcdReader
@@ -32,10 +34,6 @@ from mlbatch.writers.atomic import PARTIAL_SUFFIX
 if TYPE_CHECKING:
     from mlbatch.outputs.mcap_file import McapFile
 
-_METADATA = "metadata.yaml"
-_MCAP_MAGIC = b"\x89MCAP0\r\n"
-_BAG_MAGIC = b"#ROSBAG V2.0\n"
-_CLOUD = "sensor_msgs/PointCloud2"
 _SCHEMA = "mlbatch.scan/1"
 _WITHOUT_HEADER = (NUSCENES_SUFFIX, KITTI_SUFFIX)
 
@@ -58,24 +56,25 @@ def read(path: Path) -> Iterator[Scan]:
 
 
 def _scans(path: Path) -> Iterator[Scan]:
-    if path.is_dir():
-        return _scans_of_folder(path)
-    try:
-        with open_file(path) as file:
-            head = file.read(16)
-    except OSError as err:
-        raise RecordingError(
-            f"{path}: expected an output of `mlbatch convert`, found {err.strerror!r}; check the "
-            "name"
-        ) from err
-    if head.startswith(_MCAP_MAGIC):
+    kind = kind_of(path)
+    if kind.name == "mcap":
         return _scans_of_mcap(path, {path.name: path})
-    if head.startswith(_BAG_MAGIC):
+    if kind.name == "rosbag1":
         return _scans_of_bag(path)
+    log = CheckLog()
+    if kind.name == "rosbag2":
+        from mlbatch.outputs.rosbag2 import open_bag
+
+        bag, _ = open_bag(log, path)
+        _refuse_damage(log, path)
+        return _scans_of_mcap(path, {f"{path.name}/{file.name}": file for file in bag})
+    if kind.form is not None:
+        files = scan_files(log, path, kind.form.suffix)
+        _refuse_damage(log, path)
+        return _scans_of_files(path, kind.form.suffix, files)
     suffix = next((one for one in _FILE_READERS if path.name.endswith(one)), None)
-    if suffix is not None:
+    if suffix is not None and path.is_file():
         folder = path.parent
-        log = CheckLog()
         named = [file for file in scan_files(log, folder, suffix) if file.path == path]
         # The files of a sensor are in a folder of their own.
         if not RunFiles.of(folder).report and RunFiles.of(folder.parent).report:
@@ -84,30 +83,8 @@ def _scans(path: Path) -> Iterator[Scan]:
         if named:
             return _scans_of_files(folder, suffix, named)
     raise RecordingError(
-        f"{path}: expected an output of `mlbatch convert`, found another file; name the .mcap or "
-        ".bag file, or the folder"
-    )
-
-
-def _scans_of_folder(path: Path) -> Iterator[Scan]:
-    refuse_shard(path)
-    inside = entries(path)
-    if any(entry.name == _METADATA for entry in inside):
-        from mlbatch.outputs.rosbag2 import open_bag
-
-        log = CheckLog()
-        bag, _ = open_bag(log, path)
-        _refuse_damage(log, path)
-        return _scans_of_mcap(path, {f"{path.name}/{file.name}": file for file in bag})
-    for suffix in _FILE_READERS:
-        log = CheckLog()
-        files = scan_files(log, path, suffix)
-        if files:
-            _refuse_damage(log, path)
-            return _scans_of_files(path, suffix, files)
-    raise RecordingError(
-        f"{path}: expected an output of `mlbatch convert`, found a folder without scans; name the "
-        "output"
+        f"{path}: expected an output of `mlbatch convert` (a .mcap or .bag file, or a folder), "
+        f"found {kind.found}; name one"
     )
 
 
@@ -135,7 +112,7 @@ def _scans_of_mcap(output: Path, paths: Mapping[str, Path]) -> Iterator[Scan]:
             clouds = _Clouds(_run_of_mcap(output, path, file))
         for message in file.messages():
             _refuse_damage(log, path)
-            if message.type == _CLOUD:
+            if message.type == CLOUD:
                 yield from clouds.scan(message.topic, message.data, message.encoding)
         _refuse_damage(log, path)
 
@@ -181,7 +158,7 @@ def _scans_of_bag(path: Path) -> Iterator[Scan]:
     clouds = _Clouds(RunFiles.of(path).about())
     for message in BagFile(log, path, path.name).messages():
         _refuse_damage(log, path)
-        if message.type == _CLOUD:
+        if message.type == CLOUD:
             yield from clouds.scan(message.topic, message.data, message.encoding)
     _refuse_damage(log, path)
 
@@ -199,7 +176,6 @@ class _Clouds:
 
     def scan(self, topic: str, data: bytes | memoryview, encoding: str) -> Iterator[Scan]:
         """The scan of a message; none for a forwarded topic."""
-        from mlbatch.outputs.cloud_messages import read_cloud
         from mlbatch.outputs.encoding import MessageCursor
 
         own = {"/points": None} | {

@@ -9,21 +9,19 @@ from pathlib import Path
 import numpy as np
 
 from mlbatch.arrays import BoolArray, F32Array, F64Array, U8Array, U16Array
-from mlbatch.bounded import open_file
 from mlbatch.outputs.cloud_messages import CLOUD, read_cloud, stored_scan
 from mlbatch.outputs.containers import BoundedFile, Message, library_errors
 from mlbatch.outputs.damage import CheckLog, DamageError, VerifyError
 from mlbatch.outputs.encoding import MessageCursor
-from mlbatch.outputs.file_formats import FILE_FORMATS
+from mlbatch.outputs.file_formats import FileFormat
 from mlbatch.outputs.folders import entries, scan_files
+from mlbatch.outputs.kinds import kind_of
 from mlbatch.outputs.stored_scan import StoredScan
 from mlbatch.page.windows import Windows
 from mlbatch.units import NS_PER_S
 
 # Points of all scans on a page: 9 bytes each, 12 in base64.
 MOST_POINTS = 54_000
-_MCAP_MAGIC = b"\x89MCAP0\r\n"
-_BAG_MAGIC = b"#ROSBAG V2.0\n"
 # Opcode and length.
 _RECORD_HEAD_BYTES = 9
 _BYTE = 255
@@ -107,45 +105,33 @@ def read_clouds(output: Path, places: list[Place], sensors: tuple[str, ...]) -> 
 
 def mcaps_of(path: Path) -> list[Path]:
     """The MCAP files of an output: itself, or those in a bag folder; none in other outputs."""
-    if path.is_dir():
+    kind = kind_of(path).name
+    if kind == "rosbag2":
         return [entry for entry in entries(path) if entry.suffix == ".mcap"]
-    return [path] if _begins_with(path, _MCAP_MAGIC) else []
-
-
-def _begins_with(path: Path, magic: bytes) -> bool:
-    try:
-        with open_file(path) as file:
-            return file.read(len(magic)) == magic
-    except OSError as err:
-        raise VerifyError(f"{path}: expected a readable file, found {err.strerror!r}") from err
+    return [path] if kind == "mcap" else []
 
 
 def _scans(output: Path, places: list[Place], sensors: tuple[str, ...]) -> Iterator[StoredScan]:
-    files = mcaps_of(output)
+    kind = kind_of(output)
     topics = {"/points": None} | {f"/{name}/points": i for i, name in enumerate(sensors)}
-    for file in files:
-        yield from _of_messages(_mcap_messages(file, places, list(topics)), topics)
-    if files:
-        return
-    if output.is_dir():
-        yield from _of_files(output, places)
-    elif _begins_with(output, _BAG_MAGIC):
+    if kind.form is not None:
+        yield from _of_files(output, kind.form, places)
+    elif kind.name == "rosbag1":
         yield from _of_messages(_bag_messages(output, places, list(topics)), topics)
-    else:
-        raise VerifyError(f"{output}: expected an output of mlbatch, found another file")
+    elif not kind.name:
+        raise VerifyError(f"{output}: expected an output of mlbatch, found {kind.found}")
+    for file in mcaps_of(output):
+        yield from _of_messages(_mcap_messages(file, places, list(topics)), topics)
 
 
-def _of_files(folder: Path, places: list[Place]) -> Iterator[StoredScan]:
+def _of_files(folder: Path, form: FileFormat, places: list[Place]) -> Iterator[StoredScan]:
     log = CheckLog()
     keys = {(place.index, place.slice) for place in places}
-    for form in FILE_FORMATS:
-        files = scan_files(log, folder, form.suffix)
-        if not files:
-            continue
+    files = scan_files(log, folder, form.suffix)
+    if files:
         reader = form.reader(log)
         reader.begin(files[0])
         yield from reader.scans([one for one in files if (one.index, one.slice or 0) in keys])
-        return
 
 
 def _of_messages(

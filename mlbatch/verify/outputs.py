@@ -7,16 +7,15 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from mlbatch.bounded import open_file
 from mlbatch.outputs import npz
 from mlbatch.outputs.damage import CheckLog, DamageError, VerifyError
-from mlbatch.outputs.file_formats import FileFormat, format_of
+from mlbatch.outputs.file_formats import FileFormat
 from mlbatch.outputs.float_rows import RowReader
-from mlbatch.outputs.folders import entries, refuse_shard, scan_files
+from mlbatch.outputs.folders import scan_files
+from mlbatch.outputs.kinds import kind_of
 from mlbatch.outputs.metadata import RunMetadata, metadata_of_grid
 from mlbatch.verify import messages
 from mlbatch.verify.examination import Examination, Progress
@@ -27,11 +26,8 @@ from mlbatch.verify.verdict import Verdict, outcomes
 if TYPE_CHECKING:
     from mlbatch.outputs.rosbag2 import BagFile
 
-_METADATA = "metadata.yaml"
 # In mlbatch.grid of each of several files; their report and table are in the folder.
 _PIECES = "windows_per_file"
-_MCAP_MAGIC = b"\x89MCAP0\r\n"
-_BAG_MAGIC = b"#ROSBAG V2.0\n"
 _RANGES = "ranges to 1 m: beams do not leave from the origin of their sensor"
 _NO_REPORT = "no report in or next to the output; give it with --report"
 _FOREIGN = "expected an output of mlbatch (a folder of scans, an MCAP file, a bag)"
@@ -73,35 +69,17 @@ class Output:
 
 def check_output(output: Output) -> Verdict:
     """Check an output of any kind."""
-    path = output.path
-    if path.is_dir():
-        check = _check_of_folder(path)
-        return check(output)
-    try:
-        with open_file(path) as file:
-            head = file.read(16)
-    except OSError as err:
-        raise VerifyError(f"{path}: expected a readable file, found {err.strerror!r}") from err
-    if head.startswith(_MCAP_MAGIC):
-        return _check_mcap(output, [path], "mcap")
-    if head.startswith(_BAG_MAGIC):
-        return _check_bag(output)
-    kind = "an empty file" if not head else "a file of another kind"
-    raise VerifyError(f"{path}: {_FOREIGN}, found {kind}; {_NAME_ONE}")
-
-
-def _check_of_folder(path: Path) -> Callable[[Output], Verdict]:
-    refuse_shard(path)
-    inside = entries(path)
-    if any(entry.name == _METADATA for entry in inside):
-        return _check_rosbag2
-    folders = [entry for entry in inside if entry.is_dir() and not entry.name.startswith(".")]
-    names = [*inside, *(inner for folder in folders for inner in entries(folder))]
-    found = format_of(names)
-    if found is not None:
-        return partial(_check_files, found)
-    kind = "an empty folder" if not inside else "a folder without scans"
-    raise VerifyError(f"{path}: {_FOREIGN}, found {kind}; {_NAME_ONE}")
+    kind = kind_of(output.path)
+    if kind.form is not None:
+        return _check_files(kind.form, output)
+    checks: dict[str, Callable[[Output], Verdict]] = {
+        "mcap": lambda one: _check_mcap(one, [one.path], "mcap"),
+        "rosbag1": _check_bag,
+        "rosbag2": _check_rosbag2,
+    }
+    if kind.name not in checks:
+        raise VerifyError(f"{output.path}: {_FOREIGN}, found {kind.found}; {_NAME_ONE}")
+    return checks[kind.name](output)
 
 
 def _check_files(form: FileFormat, output: Output) -> Verdict:

@@ -281,8 +281,8 @@ def test_damage_is_an_error(name: str, kind: str | None, rec: Recording, tmp_pat
     [
         ("nothing.mcap", "found 'No such file or directory'"),
         ("scans.mcap.partial", "expected a finished output, found that of an unfinished run"),
-        ("empty", "found a folder without scans"),
-        ("other.txt", "found another file"),
+        ("empty", "found an empty folder"),
+        ("other.txt", "found a file of another kind"),
     ],
 )
 def test_what_is_no_output(name: str, expected: str, tmp_path: Path) -> None:
