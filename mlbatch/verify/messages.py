@@ -234,7 +234,7 @@ class TopicChecks:
             below.setdefault(one.parent, []).append(one.child)
         roots = set(below) - set(children)
         if transforms and self.metadata.frame_id is not None:
-            log.equal("tf_static", f"{where} root", {self.metadata.frame_id}, roots)
+            log.equal("tf_static", f"{where} root", [self.metadata.frame_id], sorted(roots))
         elif transforms:
             log.equal("tf_static", f"{where} number of roots", 1, len(roots))
         self.tree |= {*children, *roots}

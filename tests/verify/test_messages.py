@@ -36,6 +36,7 @@ from tests.builders.verify_outputs import (
     cases,
     check_case,
     copied,
+    damaged,
     flipped,
     raw,
     report,
@@ -329,6 +330,14 @@ TABLES = {
 @pytest.mark.parametrize(("kind", "case"), cases(TABLES))
 def test_damage_is_found(kind: str, case: Case, tmp_path: Path) -> None:
     check_case(kind, case, tmp_path)
+
+
+def test_frames_are_named_in_order(tmp_path: Path) -> None:
+    """The order in a set depends on the process."""
+    edit, _, _ = MCAP["frame of transforms"]
+    found = {one.where: one for one in damaged("scans.mcap", tmp_path, edit).violations}
+    root = found["scans.mcap /tf_static message 0 root"]
+    assert (root.expected, root.found) == ("['base_link']", "['base_link', 'cars_link']")
 
 
 @pytest.mark.parametrize(
