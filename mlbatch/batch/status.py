@@ -8,7 +8,7 @@ from pathlib import Path
 from mlbatch.batch.record import SessionRecord, parse_record, read_record
 from mlbatch.batch.session import LOG_TXT, SESSION_JSON, STARTED_JSON, is_url
 from mlbatch.errors import RecordingError
-from mlbatch.report.limits import CUT_OFF
+from mlbatch.report.report import CUT_OFF
 
 # Warnings of clocks, as in the page of a run.
 CLOCK_CODES = frozenset(

@@ -28,10 +28,8 @@ from mlbatch.errors import (
 from mlbatch.pipeline import preflight
 from mlbatch.pipeline.conversion import Conversion, Progress
 from mlbatch.pipeline.interrupts import interruptible
-from mlbatch.pipeline.job import Job
+from mlbatch.pipeline.job import Job, TimeSegment
 from mlbatch.pipeline.run import Last, OpenWriter, convert
-from mlbatch.pipeline.segments import TimeSegment
-from mlbatch.report.limits import Limit, exceeded
 from mlbatch.report.report import RunReport, build_report, report_text
 from mlbatch.types import RunInfo
 from mlbatch.writers import (
@@ -62,6 +60,7 @@ from mlbatch.writers import (
 if TYPE_CHECKING:
     from mlbatch.pipeline.files import Files
     from mlbatch.pipeline.shards import Shard
+    from mlbatch.report.limits import Limit
 
 
 class Target(NamedTuple):
@@ -162,6 +161,11 @@ def _run_one(job: Job, target: Target) -> list[str]:
         typer.echo(report_text(inputs, in_a_line=target.split_jumps), nl=False)
     elif not target.quiet:
         _print_summary(conversion, inputs, target, report_path)
+    if not target.limits:
+        return []
+    # Not loaded without limits.
+    from mlbatch.report.limits import exceeded
+
     return exceeded(target.limits, build_report(inputs))
 
 
@@ -179,6 +183,8 @@ def _beyond_limits_before(target: Target, name: str) -> list[str]:
     """What exceeds limits in the output that an earlier run completed; name: of the format."""
     if not target.limits or target.output is None:
         return []
+    from mlbatch.report.limits import exceeded
+
     path = target.report or report_paths(target.output, name).report
     try:
         return exceeded(target.limits, parse_json(read_text(path)))

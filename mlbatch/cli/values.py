@@ -14,7 +14,6 @@ from mlbatch.errors import UsageError
 from mlbatch.options import INSTANTS
 from mlbatch.pipeline.job import Job, check_max_bag_s
 from mlbatch.python.options import RatedOptions, SessionOptions, choice, session_job, window_job
-from mlbatch.report.limits import parse_limits
 from mlbatch.sensors import DECODE_OPTIONS
 from mlbatch.units import parse_rate
 from mlbatch.writers import parse_jobs
@@ -22,6 +21,7 @@ from mlbatch.writers import parse_jobs
 if TYPE_CHECKING:
     from mlbatch.faults import Fault
     from mlbatch.pipeline.shards import Shard
+    from mlbatch.report.limits import Limit
 
 
 # Options whose values need no text to be read, by the tables of Python.
@@ -71,10 +71,19 @@ def target_of(values: Mapping[str, Any]) -> Target:
         report=None if is_stdout(report) else report,
         prints_report=is_stdout(report),
         split_jumps=on_jump == "split",
-        limits=parse_limits(values["fail_on"] or ()),
+        limits=_fail_on(values["fail_on"] or ()),
         resume=resume(values["resume"], dry_run=values["dry_run"]),
         fsync=not values["no_fsync"],
     )
+
+
+def _fail_on(texts: Sequence[str]) -> tuple[Limit, ...]:
+    if not texts:
+        return ()
+    # Not loaded without limits.
+    from mlbatch.report.limits import parse_limits
+
+    return parse_limits(texts)
 
 
 def long_name(name: str) -> str:

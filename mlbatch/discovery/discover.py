@@ -43,7 +43,6 @@ from mlbatch.errors import ClockError, RecordingError, RigError, UsageError
 from mlbatch.frames.tree import FrameTree, clean, some
 from mlbatch.lidar.interface import Calibration
 from mlbatch.rig.rig import Rig, RigSensor, read_rig
-from mlbatch.sensors.advice import with_advice
 from mlbatch.types import Recording, Stream, StreamTable
 from mlbatch.units import NS_PER_S
 
@@ -180,12 +179,9 @@ def discover(
     if to_convert and not any(sensor.kinds for sensor in matched.sensors):
         examined = examined or find_calibrations(paths, selection.metadata)[1]
         names = _names(examined, recorded)
-        reason = _why_none(sampler, recordings, lidar_kinds, names, matched.failures, refused)
+        reason, lacking = _why_none(sampler, recordings, lidar_kinds, names, matched, refused)
         text = f"{reason}{_hints(recordings, examined, collector)}"
-        described = [describe(sampler, kind) or "" for kind in lidar_kinds]
-        lacking = [what for what in described if not lacks_decoder(what)]
-        is_missing = bool(lacking) and not matched.failures and not refused
-        raise RecordingError(with_advice(text, lacking[0]) if is_missing else text)
+        raise RecordingError(_advised(text, lacking) if lacking else text)
     chosen = _choose(sampler, matched.sensors, lidar_kinds, selection)
     left_out = [sensor for sensor in matched.sensors if sensor not in chosen]
     ignored = Ignored(tuple(left_out), selection.ignore, bool(selection.only))
@@ -437,6 +433,51 @@ def _names(examined: Sequence[Path], recorded: Sequence[Calibration]) -> list[st
     return [*(path.name for path in examined), *(str(one.path) for one in recorded)]
 
 
+class Refusal(NamedTuple):
+    """What is said of lidar packets without a sensor: of some among others, and where all are."""
+
+    code: str
+    among_others: str
+    alone: str
+
+
+# By cause; where there is no sensor at all, the first of these that occurs is told.
+_REFUSALS = {
+    "unusable": Refusal(
+        "no_metadata",
+        "{stream}: {what}; {failure}, or leave it out with {ignore}",
+        "{stream}: {failure}{others}",
+    ),
+    "no_metadata": Refusal(
+        "no_metadata",
+        "{stream}: {what}; expected metadata that match, found {known}; give --metadata FILE, or "
+        "leave it out with {ignore}{faults}",
+        "{stream} carries {what}; expected metadata that match, found {known}; give the sensor's "
+        "with --metadata FILE",
+    ),
+    "no_decoder": Refusal(
+        "no_decoder",
+        f"{{stream}}: {{what}}; {_NO_SUPPORTED}; leave it out with {{ignore}}",
+        f"{{stream}} carries {{what}}; {_NO_SUPPORTED}",
+    ),
+}
+
+
+def _cause(matched: Matched, kind: PacketKind, what: str) -> str:
+    """Why packets of a lidar have no sensor, a key of `_REFUSALS`; what: their description."""
+    if lacks_decoder(what):
+        return "no_decoder"
+    return "unusable" if kind in matched.failures else "no_metadata"
+
+
+def _advised(text: str, what: str) -> str:
+    """A text, and where the metadata of a lidar come from."""
+    # Not loaded where all have theirs.
+    from mlbatch.sensors.advice import with_advice
+
+    return with_advice(text, what)
+
+
 def _unmatched(
     sampler: Sampler,
     matched: Matched,
@@ -453,19 +494,19 @@ def _unmatched(
     faults = some([*filter(None, map(fault_of, examined))], _SHOWN) if kinds else ""
     for kind in kinds:
         what = describe(sampler, kind) or ""
-        start = f"{sampler.table.streams[kind.stream]}: {what}"
-        ignore = f"--ignore {_ignore_word(sampler.table.streams[kind.stream])}"
-        if lacks_decoder(what):
-            note = Note("no_decoder", "", f"{start}; {_NO_SUPPORTED}; leave it out with {ignore}")
-        elif kind in matched.failures:
-            text = f"{start}; {matched.failures[kind]}, or leave it out with {ignore}"
-            note = Note("no_metadata", "", text)
-        else:
-            expected = f"expected metadata that match, found {_known(names)}"
-            text = f"{start}; {expected}; give --metadata FILE, or leave it out with {ignore}"
-            text += f" ({faults})" if faults else ""
-            note = Note("no_metadata", "", with_advice(text, what))
-        notes.append((kind, note))
+        stream = sampler.table.streams[kind.stream]
+        cause = _cause(matched, kind, what)
+        code, sentence, _ = _REFUSALS[cause]
+        text = sentence.format(
+            stream=stream,
+            what=what,
+            failure=matched.failures.get(kind),
+            known=_known(names),
+            ignore=f"--ignore {_ignore_word(stream)}",
+            faults=f" ({faults})" if faults else "",
+        )
+        text = _advised(text, what) if cause == "no_metadata" else text
+        notes.append((kind, Note(code, "", text)))
     return notes
 
 
@@ -583,28 +624,37 @@ def _why_none(
     sampler: Sampler,
     recordings: Sequence[Recording],
     lidar_kinds: Sequence[PacketKind],
-    examined: Sequence[str],
-    failures: Mapping[PacketKind, str],
+    names: Sequence[str],
+    matched: Matched,
     refused: Mapping[str, str],
-) -> str:
-    """Why no sensor was found, and what to do; refused: why clouds cannot be used, by topic."""
+) -> tuple[str, str]:
+    """Why no sensor was found, and the lidar whose metadata are missing, or "".
+
+    names: of possible calibrations; refused: why clouds cannot be used, by topic.
+    """
     where = _paths(recordings)
     table = sampler.table
     types = packet_types(recordings)
-    for kind, why in failures.items():
-        others = f" (without a match: {some(examined, _SHOWN)})" if examined else ""
-        return f"{where}: {table.streams[kind.stream]}: {why}{others}"
-    if refused:
-        return f"{where}: {_some_texts(_refusals(refused))}"
-    carried = [(table.streams[kind.stream], describe(sampler, kind) or "") for kind in lidar_kinds]
-    for stream, what in carried:
-        if not lacks_decoder(what):
-            return (
-                f"{where}: {stream} carries {what}; expected metadata that match, "
-                f"found {_known(examined)}; give the sensor's with --metadata FILE"
-            )
-    for stream, what in carried:
-        return f"{where}: {stream} carries {what}; {_NO_SUPPORTED}"
+    found: dict[str, PacketKind] = {}
+    for kind in matched.failures:
+        found.setdefault("unusable", kind)
+    if refused and not found:
+        return f"{where}: {_some_texts(_refusals(refused))}", ""
+    for kind in lidar_kinds:
+        found.setdefault(_cause(matched, kind, describe(sampler, kind) or ""), kind)
+    for cause, refusal in _REFUSALS.items():
+        if cause not in found:
+            continue
+        kind = found[cause]
+        what = describe(sampler, kind) or ""
+        text = refusal.alone.format(
+            stream=table.streams[kind.stream],
+            what=what,
+            failure=matched.failures.get(kind),
+            others=f" (without a match: {some(names, _SHOWN)})" if names else "",
+            known=_known(names),
+        )
+        return f"{where}: {text}", what if cause == "no_metadata" else ""
     seen = [
         f"{table.streams[kind.stream]} ({kind.size} bytes: {name_kind(sampler, kind, types)})"
         for kind in sampler.kinds
@@ -617,7 +667,8 @@ def _why_none(
     )
     return (
         f"{where}: no lidar packets; expected raw UDP packets of a supported lidar "
-        f"(see `mlbatch sensors`), found {some(seen, _SHOWN) or 'no UDP packet at all'}; {remedy}"
+        f"(see `mlbatch sensors`), found {some(seen, _SHOWN) or 'no UDP packet at all'}; {remedy}",
+        "",
     )
 
 

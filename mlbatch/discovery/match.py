@@ -10,7 +10,6 @@ import ipaddress
 import re
 from collections import Counter
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple, NoReturn
 
@@ -24,7 +23,6 @@ from mlbatch.errors import RecordingError, RigError
 from mlbatch.frames.naming import GENERIC, namespace
 from mlbatch.lidar.interface import NAMED_ONLY, Calibration, Evidence, Lidar, ModelFile
 from mlbatch.rig.rig import MAX_NAME, RigSensor, StreamSelector
-from mlbatch.sensors.advice import with_advice
 from mlbatch.types import StreamTable
 
 # Of the samples of a kind: some hundred packets of 1 kB are less.
@@ -45,11 +43,12 @@ class Matched(NamedTuple):
 
 
 class Fit(NamedTuple):
-    """A calibration that matches packets."""
+    """A calibration that matches packets; kinds: all that it fits, where several were tried."""
 
     score: int
     number: int  # index of the calibration
     lidar: Lidar
+    kinds: frozenset[PacketKind] = frozenset()
 
 
 class _Candidate(NamedTuple):
@@ -333,14 +332,6 @@ def is_model(expected: str, found: str) -> bool:
     return found in reported_as or found.replace("-", "").startswith(expected.replace("-", ""))
 
 
-@dataclass(slots=True)
-class _Match:
-    """The best fit of one calibration, and the kinds it fits."""
-
-    fit: Fit
-    kinds: set[PacketKind]
-
-
 def _detect(sampler: Sampler, expected: ExpectedSensor, origin: Path) -> DetectedSensor | None:
     """A sensor of the rig by its packets; None if it sent none."""
     serial = expected.selector.serial
@@ -350,7 +341,7 @@ def _detect(sampler: Sampler, expected: ExpectedSensor, origin: Path) -> Detecte
     has_own_file = any(serial and one.serial == serial for one in usable)
     if has_own_file:
         usable = [one for one in usable if one.serial == serial]
-    matches: dict[int, _Match] = {}
+    matches: dict[int, Fit] = {}
     failures: list[str] = []
     other_serials: set[str] = set()
     other_models: set[str] = set()
@@ -369,10 +360,9 @@ def _detect(sampler: Sampler, expected: ExpectedSensor, origin: Path) -> Detecte
             ):
                 other_models.add(fit.lidar.model)
             else:
-                known = matches.setdefault(fit.number, _Match(fit, set()))
-                known.kinds.add(kind)
-                if fit.score > known.fit.score:
-                    known.fit = fit
+                known = matches.get(fit.number, fit)
+                best = fit if fit.score > known.score else known
+                matches[fit.number] = best._replace(kinds=known.kinds | {kind})
     if matches:
         return _chosen(sampler, expected, list(matches.values()), origin)
     start = f"{origin}: sensor {expected.name}:"
@@ -395,23 +385,25 @@ def _detect(sampler: Sampler, expected: ExpectedSensor, origin: Path) -> Detecte
 
 
 def _chosen(
-    sampler: Sampler, expected: ExpectedSensor, matches: Sequence[_Match], origin: Path
+    sampler: Sampler, expected: ExpectedSensor, matches: Sequence[Fit], origin: Path
 ) -> DetectedSensor:
     """The only sensor that matches; merely readable packets count only without others."""
-    sure = [one for one in matches if one.fit.score != NAMED_ONLY] or matches
-    best = max(sure, key=lambda one: one.fit.score)
-    lidar = best.fit.lidar
-    units = {one.fit.lidar.serial or str(one.fit.number) for one in sure}
+    sure = [one for one in matches if one.score != NAMED_ONLY] or matches
+    best = max(sure, key=lambda one: one.score)
+    lidar = best.lidar
+    units = {one.lidar.serial or str(one.number) for one in sure}
     streams = {str(sampler.table.streams[kind.stream]) for one in sure for kind in one.kinds}
     if len(units) > 1 or (len(streams) > 1 and not lidar.carries_serial):
-        models = sorted({one.fit.lidar.model for one in sure})
+        models = sorted({one.lidar.model for one in sure})
         raise RigError(
             f"{origin}: sensor {expected.name}: expected packets of one lidar, found those of "
             f"several ({', '.join(models)}) on {', '.join(sorted(streams))}; name its stream "
             "(source_ip, port, topic or serial)"
         )
-    found = DetectedSensor(expected.name, lidar, expected.selector, best.kinds, rig=expected.rig)
-    if best.fit.score == NAMED_ONLY:
+    found = DetectedSensor(
+        expected.name, lidar, expected.selector, set(best.kinds), rig=expected.rig
+    )
+    if best.score == NAMED_ONLY:
         what = describe(sampler, min(best.kinds)) or "another model"
         found.notes.append(f"read as {lidar.model}, which the rig names; it looks like {what}")
     for kind in sorted(best.kinds):
@@ -457,6 +449,9 @@ def _refuse_same_packets(table: StreamTable, found: Sequence[DetectedSensor], or
 
 
 def _refuse_no_metadata(expected: ExpectedSensor, origin: Path) -> NoReturn:
+    # Not loaded where all have theirs.
+    from mlbatch.sensors.advice import with_advice
+
     serial = expected.selector.serial
     text = (
         f"{origin}: sensor {expected.name}: no metadata"

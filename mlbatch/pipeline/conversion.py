@@ -23,10 +23,8 @@ from mlbatch.pipeline import run_report
 from mlbatch.pipeline.decode_pool import DecodePool, DecodeTask
 from mlbatch.pipeline.job import DEFAULT_RATE, Job
 from mlbatch.pipeline.passthrough import Passthrough
-from mlbatch.pipeline.point_notes import refuse_all_removed
 from mlbatch.pipeline.sensor import Sensor
 from mlbatch.pipeline.session import Session
-from mlbatch.pipeline.time_limits import refuse_outside
 from mlbatch.report.ledger import PointCounts
 from mlbatch.report.scan_table import ScanTable
 from mlbatch.types import BYTE_INTENSITY, ImuSamples, Message, RunInfo, Scan, Topic
@@ -372,6 +370,11 @@ class Conversion:
 
     def _check_limits(self) -> None:
         """Refuse `--start` and `--end` that are no times of the recording."""
+        if self.job.start is None and self.job.end is None:
+            return
+        # Not loaded for whole recordings.
+        from mlbatch.pipeline.time_limits import refuse_outside
+
         firsts = [first[0] for first in self.batcher.firsts if first is not None]
         # Later segments begin where another one ended, and need not contain the limits.
         if firsts and self.job.segment.begin_ns is None:
@@ -440,7 +443,7 @@ class Conversion:
         points: Iterable[Note] = ()
         if self.job.shard is None:
             where = ", ".join(map(str, self.job.recordings))
-            refuse_all_removed(where, [sensor.ledger.points for sensor in self.sensors])
+            run_report.refuse_all_removed(where, [sensor.ledger.points for sensor in self.sensors])
             points = run_report.notes_of_run(self)
         for note in (*points, *run_report.unassigned_notes(self), *self.session.clocks.notes()):
             self.warn(note)

@@ -7,13 +7,12 @@ from dataclasses import dataclass, field
 from fractions import Fraction
 from operator import index
 from pathlib import Path
-from typing import TYPE_CHECKING, SupportsIndex
+from typing import TYPE_CHECKING, NamedTuple, SupportsIndex
 
 from mlbatch.batching.windows import COMMON, WINDOW, Limit
 from mlbatch.discovery.discover import SensorSelection
 from mlbatch.errors import UsageError
 from mlbatch.options import BATCHING_TIMES, BATCHINGS, INSTANTS, SORTS
-from mlbatch.pipeline.segments import TimeSegment
 from mlbatch.types import EXTRAS, RecordLayout
 from mlbatch.units import NS_PER_S
 
@@ -26,6 +25,13 @@ DEFAULT_MAX_WAIT_NS = NS_PER_S
 # Upper bound of any time, s: its nanoseconds fit into int64.
 MOST_S = 2**33
 MAX_SLICES = 10_000
+
+
+class TimeSegment(NamedTuple):
+    """Receive times in [begin_ns, end_ns); None: no limit."""
+
+    begin_ns: int | None = None
+    end_ns: int | None = None
 
 
 @dataclass(frozen=True, slots=True)

@@ -22,7 +22,7 @@ from isal.isal_zlib import crc32
 from mlbatch.errors import ExportError, RecordingError, UsageError
 from mlbatch.pipeline.files import records
 from mlbatch.pipeline.job_identity import difference
-from mlbatch.pipeline.point_notes import point_notes, refuse_all_removed
+from mlbatch.pipeline.run_report import point_notes, refuse_all_removed
 from mlbatch.pipeline.shards import Account, read_account
 from mlbatch.report.ledger import PointCounts
 from mlbatch.report.report import (

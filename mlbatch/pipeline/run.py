@@ -7,7 +7,9 @@ and N decode and write, a scan each.
 from __future__ import annotations
 
 import contextlib
+import ctypes
 import itertools
+import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
@@ -17,7 +19,6 @@ from mlbatch.errors import NoScanError, RecordingError
 from mlbatch.pipeline import run_report
 from mlbatch.pipeline.conversion import Conversion, Progress, SkippedWindow
 from mlbatch.pipeline.decode_pool import DecodeTask, DecodeWorker
-from mlbatch.pipeline.freed_memory import return_freed_memory
 from mlbatch.pipeline.job import Job
 from mlbatch.pipeline.scan_task import ScanTask, forward
 from mlbatch.pipeline.workers import OrderedWorkers, run_inline
@@ -56,7 +57,7 @@ def convert(
     # One scan more than are waiting to be written: the one that is being decoded.
     decodes_ahead = job.jobs == 1 and open_writer is not None
     run = Conversion(job, buffers=_AHEAD + 1 if decodes_ahead else 1, progress=progress)
-    return_freed_memory()
+    _return_freed_memory()
     if files is not None:
         files.join(run)
     output = _Output(run, open_writer, files)
@@ -203,3 +204,16 @@ def _finish(run: Conversion, writer: ScanWriter | None, last: Last | None) -> Ru
     summary = Summary(run.batcher.t_init_ns, report, table, fill_totals(inputs))
     writer.finish(summary, complete)
     return inputs
+
+
+def _return_freed_memory() -> None:
+    """Return freed pages to the kernel where the C library can (glibc, since 2.8).
+
+    The search for sensors frees arrays of some MB between small objects that stay. The next arrays
+    are larger or are only partly used: they would take memory in addition to these pages.
+    """
+    if sys.platform != "linux":
+        return
+    trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
+    if trim is not None:
+        trim(0)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import resource
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -14,14 +14,13 @@ from mlbatch.discovery.discover import not_in_rig
 from mlbatch.discovery.match import describe, describe_each
 from mlbatch.discovery.sampler import MOST_KINDS
 from mlbatch.discovery.types import Note, PacketKind
+from mlbatch.errors import NoScanError
 from mlbatch.pipeline.passthrough import PASS_REASONS
-from mlbatch.pipeline.point_notes import point_notes
 from mlbatch.pipeline.sensor import Sensor
 from mlbatch.pipeline.session import CLOUDS
-from mlbatch.pipeline.time_limits import text_of_range, text_of_time
-from mlbatch.report.ledger import ordered
-from mlbatch.report.limits import CUT_OFF
+from mlbatch.report.ledger import PointCounts, ordered
 from mlbatch.report.report import (
+    CUT_OFF,
     ClockReport,
     FaultReport,
     ForwardedMessages,
@@ -330,6 +329,8 @@ def why_no_scan(run: Conversion) -> str:
     last_ns = max(span[1] for span in known)
     start_ns, _ = run.batcher.limits_ns
     if start_ns is not None and start_ns > last_ns:
+        from mlbatch.pipeline.time_limits import text_of_range, text_of_time
+
         return (
             f"{where}: no scan: expected --start in the recording, "
             f"{text_of_range(first_ns, last_ns)}, found {text_of_time(start_ns)}; choose another"
@@ -469,6 +470,50 @@ def _described(run: Conversion, kind: PacketKind, sample: U8Array) -> str:
     if text is None and kind in sampler.kinds:
         text = describe(sampler, kind)
     return text or "unknown"
+
+
+# -- points, of a run or of merged shards ----------------------------------------------------------
+
+
+def refuse_all_removed(where: str, points: Sequence[PointCounts]) -> None:
+    """Raise NoScanError if limits and boxes left no point of any sensor."""
+    by_range = sum(counts.range for counts in points)
+    by_box = sum(counts.box for counts in points)
+    if not by_range + by_box or any(counts.written for counts in points):
+        return
+    removed = [f"{by_range} by --min-range and --max-range (min_range_m, max_range_m of the rig)"]
+    removed = removed * bool(by_range)
+    if by_box:
+        removed.append(f"{by_box} by --exclude-box (exclude_boxes_m of the rig)")
+    raise NoScanError(
+        f"{where}: no scan with points: expected points within the limits, found that all "
+        f"{by_range + by_box} were removed: {', '.join(removed)}; widen the range, or make the "
+        "boxes smaller: both are in metres"
+    )
+
+
+def point_notes(points: Sequence[tuple[str, PointCounts]], scans: ScanStatistics) -> Iterator[Note]:
+    """Clipped intensities; scans with columns but no points: of a sensor, and of all.
+
+    points: name and counts of each sensor.
+    """
+    for name, counts in points:
+        if counts.clipped:
+            text = (
+                f"{name}: {counts.clipped} of {counts.written} points "
+                f"({counts.clipped / counts.written:.2%}) have an intensity outside 0 to 255, "
+                "which the point layout clips; choose one with a float32 intensity"
+            )
+            yield Note("clipped", name, text)
+    for name, count in scans.no_points.items():
+        text = (
+            f"{name}: {count} of {scans.written} scans have its columns but none of its points: no "
+            "returns, or all excluded; check its window, --min-range and --exclude-box"
+        )
+        yield Note("no_points", name, text)
+    if scans.empty_clouds:
+        text = f"{scans.empty_clouds} clouds without a point were written"
+        yield Note("empty_cloud", "", text)
 
 
 def _timing(run: Conversion) -> Timing:

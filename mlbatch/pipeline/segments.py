@@ -4,20 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Generator
 from dataclasses import replace
-from typing import NamedTuple
 
 import numpy as np
 
 from mlbatch.arrays import BoolArray
 from mlbatch.discovery.calibrations import is_metadata
+from mlbatch.pipeline.job import TimeSegment
 from mlbatch.types import Message, PacketBatch, Recording, WrappedRecording
-
-
-class TimeSegment(NamedTuple):
-    """Receive times in [begin_ns, end_ns); None: no limit."""
-
-    begin_ns: int | None = None
-    end_ns: int | None = None
 
 
 class ClippedRecording(WrappedRecording):

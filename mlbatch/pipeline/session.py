@@ -20,12 +20,11 @@ from mlbatch.native import require_library
 from mlbatch.native.arena import PacketArena
 from mlbatch.pipeline.clock_monitor import ClockMonitor
 from mlbatch.pipeline.ingest import Ingest
-from mlbatch.pipeline.job import Job
-from mlbatch.pipeline.segments import ClippedRecording, TimeSegment
+from mlbatch.pipeline.job import Job, TimeSegment
 from mlbatch.pipeline.sensor import Limits, Sensor, SensorClock, new_ring
 from mlbatch.readers import open_recordings
 from mlbatch.readers.source import BUFFER_BYTES
-from mlbatch.report.limits import ACCEPTED
+from mlbatch.report.report import ACCEPTED_WARNINGS
 from mlbatch.rig.rig import Rig, RigSensor
 from mlbatch.types import PacketBatch, Recording, RunInfo, SensorInfo, StreamTable
 from mlbatch.units import NS_PER_S
@@ -65,6 +64,9 @@ class Session:
         streams = StreamTable()
         opened = open_recordings(job.recordings, streams, job.selection.rig)
         if job.segment != TimeSegment():
+            # Not loaded for whole sessions.
+            from mlbatch.pipeline.segments import ClippedRecording
+
             opened = [ClippedRecording(recording, job.segment) for recording in opened]
         self.setup: Discovery = discover(opened, streams, job.selection)
         self.recordings: Sequence[Recording] = self.setup.recordings
@@ -256,7 +258,7 @@ class Session:
 
     def warn(self, note: Note) -> None:
         """Add a warning; RecordingError with `--strict`."""
-        if self.job.strict and note.code not in ACCEPTED:
+        if self.job.strict and note.code not in ACCEPTED_WARNINGS:
             raise RecordingError(f"{note.message} ({note.code}, an error because of --strict)")
         self.notes.append(note)
 

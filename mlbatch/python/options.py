@@ -25,7 +25,6 @@ from mlbatch.pipeline.job import (
     check_sort,
     wait_ns,
 )
-from mlbatch.pipeline.time_limits import limits_of
 from mlbatch.readers.inputs import expand
 from mlbatch.units import parse_rate
 
@@ -238,9 +237,13 @@ def window_job(job: Job, options: RatedOptions, shown: Callable[[str], str] = _a
             f"{shown('drop_incomplete')}: expected a share from 0 to 100 %, found "
             f"{drop_incomplete:g}; correct it"
         )
-    start, end, are_dates = limits_of(
-        shown("start"), options.get("start"), shown("end"), options.get("end")
-    )
+    first, last = options.get("start"), options.get("end")
+    start, end, are_dates = None, None, False
+    if first is not None or last is not None:
+        # Not loaded for whole recordings.
+        from mlbatch.pipeline.time_limits import limits_of
+
+        start, end, are_dates = limits_of(shown("start"), first, shown("end"), last)
     job = replace(
         job,
         # By the text of a float: 29.97 means 2997/100, not the nearest binary number.

@@ -8,6 +8,7 @@ from functools import partial
 from typing import NamedTuple, TypeAlias
 
 from mlbatch.errors import UsageError
+from mlbatch.report.report import ACCEPTED_WARNINGS, CUT_OFF
 
 # A part and the whole that it is a share of; 0: it is a share of nothing.
 Amount: TypeAlias = tuple[int, int]
@@ -104,7 +105,7 @@ def _cut_off(report: Report) -> Iterator[tuple[str, Amount]]:
 
 def _warnings(report: Report) -> Iterator[tuple[str, Amount]]:
     codes = [one.get("code") for one in _list(report, "warnings")]
-    yield "", (sum(code not in ACCEPTED for code in codes), 0)
+    yield "", (sum(code not in ACCEPTED_WARNINGS for code in codes), 0)
 
 
 def _packets(report: Report) -> Iterator[tuple[str, Report]]:
@@ -139,11 +140,6 @@ class _Quantity(NamedTuple):
     is_share: bool = True
 
 
-# The warning that a recording ends early.
-CUT_OFF = "cut_off"
-# Warnings that are no error with `--strict`: one is for information, one states what the user asked
-# for by an option of that name.
-ACCEPTED = frozenset({"clouds", "identity_extrinsics"})
 _QUANTITIES: Mapping[str, _Quantity] = {
     "loss": _Quantity("packets lost", _loss),
     "rejected": _Quantity("packets rejected", _rejected),

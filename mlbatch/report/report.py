@@ -34,6 +34,11 @@ SCHEMA = "mlbatch.report/1"
 
 # What differs from machine to machine.
 _OF_MACHINE = ("timing", "command", "identity")
+# The warning that a recording ends early.
+CUT_OFF = "cut_off"
+# Warnings that are no error with `--strict`: one is for information, one states what the user asked
+# for by an option of that name.
+ACCEPTED_WARNINGS = frozenset({"clouds", "identity_extrinsics"})
 
 
 class InputReport(NamedTuple):

@@ -60,6 +60,8 @@ NEEDLESS = (
     *("mlbatch.batching.fusion", "mlbatch.batching.sweeps", "mlbatch.pipeline.shards"),
     *("numpy.ma", "rosbags", "rich", "mcap.writer", "importlib.metadata"),
     *("mlbatch.readers.capture.odd", "dpkt"),
+    *("mlbatch.sensors.advice", "mlbatch.pipeline.segments", "mlbatch.pipeline.time_limits"),
+    *("mlbatch.report.limits", "mlbatch.pipeline.overlap", "mlbatch.discovery.overlap"),
 )
 
 
