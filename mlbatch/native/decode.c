@@ -46,6 +46,7 @@ typedef struct {
     _Alignas(64) float level[MOST_ELEMENTS];
     _Alignas(64) int32_t keep[MOST_ELEMENTS]; /* bits of ones, or 0 */
     _Alignas(64) uint32_t words[MOST_WORDS][MOST_BEAMS];
+    const uint8_t *words_at[MOST_WORDS]; /* in `words`, or in the record */
     _Alignas(64) uint16_t reflectivity[MOST_ELEMENTS];
     _Alignas(64) int64_t label[MOST_ELEMENTS];
     _Alignas(64) float point[MOST_ELEMENTS][POINT];
@@ -133,11 +134,18 @@ static inline Words field_of(const Field *field, Words words)
 }
 
 /* Words of the pixels of one return, of all channels; distances of 0 for channels without returns
-   and beyond the channels. */
+   and beyond the channels. Pixels that are words, all of them in a row, stay where they are. */
 static void read_words(const Group *group, const uint8_t *record, int64_t which, Planes *planes)
 {
     const int64_t *run = group->runs + which * group->run_count * 3;
     const int64_t *bytes = group->word_bytes + which * group->word_count;
+    if (group->step == 4 && group->word_count == 1 && run[2] == group->width
+        && !group->dark_count) {
+        planes->words_at[0] = record + run[0] + bytes[0];
+        return;
+    }
+    for (int64_t word = 0; word < group->word_count; word++)
+        planes->words_at[word] = (const uint8_t *)planes->words[word];
     for (int64_t number = 0; number < group->run_count; number++, run += 3)
         for (int64_t word = 0; word < group->word_count; word++)
             gather(record + run[0] + bytes[word], group->step, run[2],
@@ -151,13 +159,16 @@ static void read_words(const Group *group, const uint8_t *record, int64_t which,
         words[beam] = 0;
 }
 
-static void read_reflectivities(const uint32_t *restrict words, const Field *field, int64_t width,
+static void read_reflectivities(const uint8_t *restrict words, const Field *field, int64_t width,
                                 uint16_t *restrict reflectivity)
 {
     const int shift = (int)field->shift;
     const uint32_t mask = (uint32_t)field->mask;
-    for (int64_t beam = 0; beam < width; beam++)
-        reflectivity[beam] = (uint16_t)(words[beam] >> shift & mask);
+    for (int64_t beam = 0; beam < width; beam++) {
+        uint32_t word;
+        memcpy(&word, words + beam * (int64_t)sizeof word, sizeof word);
+        reflectivity[beam] = (uint16_t)(word >> shift & mask);
+    }
 }
 
 /* Range, level and reflectivity of all returns of a column, and which have a range. */
@@ -170,10 +181,12 @@ static void read_pixels(const Group *group, const uint8_t *record, Planes *plane
         const Field *fields = group->fields + which * FIELDS;
         const Field distance = fields[DISTANCE], level = fields[INTENSITY];
         read_words(group, record, which, planes);
+        const uint8_t *distances = planes->words_at[distance.word];
+        const uint8_t *levels = planes->words_at[level.word];
         for (int64_t beam = 0, element = which * width; beam < width;
              beam += LANES, element += LANES) {
             Words words;
-            memcpy(&words, planes->words[distance.word] + beam, sizeof words);
+            memcpy(&words, distances + beam * (int64_t)sizeof(uint32_t), sizeof words);
             words >>= (uint32_t)distance.shift;
             if (distance.is_big)
                 words = (words & 0xFF) << 8 | (words >> 8 & 0xFF);
@@ -186,12 +199,12 @@ static void read_pixels(const Group *group, const uint8_t *record, Planes *plane
             }
             store(planes->range_m + element,
                   __builtin_convertvector(value & keep, Floats) * factor / divisor);
-            memcpy(&words, planes->words[level.word] + beam, sizeof words);
+            memcpy(&words, levels + beam * (int64_t)sizeof(uint32_t), sizeof words);
             store(planes->level + element,
                   __builtin_convertvector((Ints)field_of(&level, words), Floats));
         }
         if (group->has_reflectivity)
-            read_reflectivities(planes->words[fields[REFLECTIVITY].word], fields + REFLECTIVITY,
+            read_reflectivities(planes->words_at[fields[REFLECTIVITY].word], fields + REFLECTIVITY,
                                 width, planes->reflectivity + which * width);
     }
 }
