@@ -1,7 +1,7 @@
 """Containers of simulated recordings: pcap, MCAP, SQLite bags of ROS 2.
 
-Layouts: draft-ietf-opsawg-pcap, RFC 791 (IPv4), RFC 768 (UDP); MCAP specification; db schema 3 of
-rosbag2 (docs/sources/messages.md, section 5).
+Layouts: draft-ietf-opsawg-pcap; MCAP specification; db schema 3 of rosbag2
+(docs/sources/messages.md, section 5).
 """
 
 from __future__ import annotations
@@ -12,6 +12,9 @@ from collections.abc import Callable
 from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Protocol
+
+from dpkt.ip import IP, IP_PROTO_UDP
+from dpkt.udp import UDP
 
 from mlbatch.ros.definitions import definition, qos
 from mlbatch.units import NS_PER_S
@@ -28,9 +31,6 @@ _RECEIVER = ipaddress.IPv4Address("10.5.5.1").packed
 _FILE_HEADER = struct.pack("<IHHiIII", 0xA1B23C4D, 2, 4, 0, 0, 262144, 1)
 _RECORD = struct.Struct("<IIII")
 _ETHERNET = bytes(12) + b"\x08\x00"
-_IP = struct.Struct(">BBHHHBBH4s4s")
-_UDP = struct.Struct(">HHHH")
-_UDP_PROTOCOL = 17
 # Rows are committed after so many.
 _COMMIT_ROWS = 5000
 
@@ -51,19 +51,17 @@ class PcapFile:
 
     def packet(self, host_ns: int, address: str, port: int, payload: bytes) -> None:
         """Append a datagram."""
-        sender = _packed(address)
-        size = _IP.size + _UDP.size + len(payload)
         self._number = (self._number + 1) % 2**16
-        head = _IP.pack(0x45, 0, size, self._number, 0, 64, _UDP_PROTOCOL, 0, sender, _RECEIVER)
-        total = sum(struct.unpack(">10H", head))
-        while total >> 16:
-            total = (total & 0xFFFF) + (total >> 16)
-        head = head[:10] + struct.pack(">H", ~total & 0xFFFF) + head[12:]
-        length = len(_ETHERNET) + size
+        size = len(payload) + UDP.__hdr_len__
+        datagram = UDP(sport=port, dport=port, ulen=size).pack_hdr() + payload
+        # As bytes, since a datagram of dpkt would get a checksum.
+        packet = IP(
+            src=_packed(address), dst=_RECEIVER, id=self._number, p=IP_PROTO_UDP, data=datagram
+        )
+        frame = _ETHERNET + bytes(packet)
         second, rest_ns = divmod(host_ns, NS_PER_S)
-        self._file.write(_RECORD.pack(second, rest_ns, length, length))
-        udp = _UDP.pack(port, port, _UDP.size + len(payload), 0)
-        self._file.write(b"".join((_ETHERNET, head, udp, payload)))
+        self._file.write(_RECORD.pack(second, rest_ns, len(frame), len(frame)))
+        self._file.write(frame)
 
     def close(self) -> None:
         """Complete the file."""
