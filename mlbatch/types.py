@@ -119,7 +119,7 @@ class PacketBatch:
     host_ns: I64Array  # (n,) receive time at the capture host, of the completing fragment
     messages: tuple[Message, ...] = ()  # of the topics in `Recording.keep`, in file order
     place: int | None = None  # of `data[0]` in the `PacketArena` of the pass; None: elsewhere
-    # (n,) hashes of the contents, as `lidar.content_keys`; None: not known.
+    # (n,) hashes of the contents, as `lidar.headers.content_keys`; None: not known.
     content_key: I64Array | None = None
 
     def __len__(self) -> int:

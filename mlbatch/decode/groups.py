@@ -13,16 +13,15 @@ from mlbatch.arrays import F32Array, F64Array, I64Array
 from mlbatch.decode.scan_buffer import LABEL
 from mlbatch.decode.source import Source
 from mlbatch.errors import RigError
-from mlbatch.lidar.geometry import BeamTable
-from mlbatch.lidar.interface import Lidar
-from mlbatch.lidar.pixel_table import BitField, PixelTable, ReturnLayout
-from mlbatch.lidar.projections import (
+from mlbatch.lidar.geometry import (
+    BeamTable,
     Coordinates,
     CorrectedRanges,
     Mirrors,
     OffAxis,
     PlacedPoints,
 )
+from mlbatch.lidar.interface import BitField, Lidar, PixelTable, ReturnLayout
 from mlbatch.native.library import Field, Group, Ring, address
 from mlbatch.report.ledger import PointCounts
 

@@ -15,8 +15,8 @@ import numpy as np
 from mlbatch.arrays import BoolArray, F64Array, I64Array, median
 from mlbatch.discovery.sampler import Sampler
 from mlbatch.discovery.types import DetectedSensor, PacketKind
-from mlbatch.lidar.content_keys import content_keys
 from mlbatch.lidar.geometry import rotor_ticks
+from mlbatch.lidar.headers import content_keys
 from mlbatch.lidar.interface import Lidar
 from mlbatch.units import NS_PER_MS, NS_PER_S
 

@@ -23,7 +23,7 @@ from mlbatch.batching.intake import NEVER, extremes
 from mlbatch.discovery.sampler import Crowd, split_by_kind
 from mlbatch.discovery.types import DetectedSensor
 from mlbatch.errors import MlbatchError, RecordingError
-from mlbatch.lidar.content_keys import content_keys
+from mlbatch.lidar.headers import content_keys
 from mlbatch.lidar.interface import Lidar
 from mlbatch.readers import open_recording
 from mlbatch.readers.byte_records import records

@@ -42,7 +42,7 @@ Room: TypeAlias = Callable[[int, int], U8Array]
 class PackedRows(NamedTuple):
     """Packets (P, size) of a message; placed: rows with a place; points: those with a time, too.
 
-    content_key: (P,) as `lidar.content_keys`, None without factors.
+    content_key: (P,) as `lidar.headers.content_keys`, None without factors.
     """
 
     packets: U8Array

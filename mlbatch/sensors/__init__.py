@@ -21,7 +21,7 @@ from mlbatch import entry_points
 from mlbatch.arrays import U8Array
 from mlbatch.bounded import read_bytes
 from mlbatch.errors import RigError
-from mlbatch.lidar.content_keys import content_keys
+from mlbatch.lidar.headers import content_keys
 from mlbatch.lidar.interface import Calibration, SensorModel
 from mlbatch.sensors.options import DECODE_OPTIONS
 

@@ -5,12 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from mlbatch.arrays import BoolArray, F64Array, I64Array, U8Array
-from mlbatch.lidar.content_keys import content_keys
-from mlbatch.lidar.geometry import BeamTable
-from mlbatch.lidar.headers import HeaderReader, Headers
-from mlbatch.lidar.interface import Records
-from mlbatch.lidar.pixel_table import PixelTable
-from mlbatch.lidar.projections import Projection
+from mlbatch.lidar.geometry import BeamTable, Projection
+from mlbatch.lidar.headers import HeaderReader, Headers, content_keys
+from mlbatch.lidar.interface import PixelTable, Records
 from mlbatch.types import ColumnHeaders, ImuSamples
 from mlbatch.units import NS_PER_S
 

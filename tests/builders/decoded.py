@@ -12,10 +12,8 @@ from mlbatch.arrays import F32Array, F64Array, I64Array, U8Array, U16Array
 from mlbatch.decode.decoder import Decoder, ScanHeader, WindowColumns
 from mlbatch.decode.groups import slot_numbers
 from mlbatch.decode.source import Source
-from mlbatch.lidar.geometry import BeamTable
-from mlbatch.lidar.interface import Lidar, Records
-from mlbatch.lidar.pixel_table import BitField, ChannelRun, PixelTable, ReturnLayout
-from mlbatch.lidar.projections import Projection
+from mlbatch.lidar.geometry import BeamTable, Projection
+from mlbatch.lidar.interface import BitField, ChannelRun, Lidar, PixelTable, Records, ReturnLayout
 from mlbatch.native.arena import PacketArena
 from mlbatch.pipeline.sensor import new_ring
 from mlbatch.sensors.base import BaseLidar

@@ -9,8 +9,7 @@ from typing import cast
 import numpy as np
 
 from mlbatch.arrays import I64Array, U8Array
-from mlbatch.lidar.content_keys import content_keys
-from mlbatch.lidar.headers import Headers
+from mlbatch.lidar.headers import Headers, content_keys
 from mlbatch.lidar.interface import Lidar
 from mlbatch.sensors.ouster.sensor import read_calibration
 from mlbatch.simulate.ouster.encode import OusterSpec, encode_packets, metadata_json

@@ -20,8 +20,8 @@ from mlbatch.batching.merge import ColumnMerge
 from mlbatch.decode.decoder import ScanHeader
 from mlbatch.decode.packet_ring import PacketRing
 from mlbatch.decode.source import Source
-from mlbatch.lidar.content_keys import content_keys, hash_factors
 from mlbatch.lidar.geometry import rotor_words
+from mlbatch.lidar.headers import content_keys, hash_factors
 from mlbatch.lidar.interface import Lidar
 from mlbatch.native.arena import PacketArena
 from mlbatch.native.library import trouble

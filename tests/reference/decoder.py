@@ -2,7 +2,7 @@
 
 It takes from a lidar what its data sheet says (places of readings, directions, firing times) and
 computes every point anew: no tables of angles, no series, no float32 but for the ranges, whose
-rounding is part of their definition (`lidar/pixel_table.py`). Positions of the compiled decoder may
+rounding is part of their definition (`lidar/interface.py`). Positions of the compiled decoder may
 differ by 0.05 mm + 3e-7 of the range; all else has to be equal.
 """
 
@@ -19,16 +19,15 @@ import numpy as np
 from mlbatch.arrays import F64Array, I64Array, U8Array
 from mlbatch.decode.packet_ring import PacketRing
 from mlbatch.decode.source import Source
-from mlbatch.lidar.geometry import BeamTable
-from mlbatch.lidar.interface import Lidar
-from mlbatch.lidar.pixel_table import BitField
-from mlbatch.lidar.projections import (
+from mlbatch.lidar.geometry import (
+    BeamTable,
     Coordinates,
     CorrectedRanges,
     Mirrors,
     OffAxis,
     PlacedPoints,
 )
+from mlbatch.lidar.interface import BitField, Lidar
 from mlbatch.types import Scan, WindowColumns
 
 Reals: TypeAlias = np.ndarray[tuple[int, ...], np.dtype[np.float32]]

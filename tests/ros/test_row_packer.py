@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mlbatch.arrays import I64Array, U8Array
-from mlbatch.lidar.content_keys import content_keys, hash_factors
+from mlbatch.lidar.headers import content_keys, hash_factors
 from mlbatch.ros.point_packets import CloudError, Layout, Points
 from mlbatch.ros.point_rows import Rows
 from mlbatch.ros.row_packer import PackedRows, RowPacker

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from mlbatch.sensors import content_keys
-from mlbatch.sensors.ouster.packets import unsigned
+from mlbatch.sensors.packet_bytes import number
 from mlbatch.simulate.velodyne.encode import VelodyneSpec
 from tests.builders.velodyne_streams import made_of
 
@@ -34,5 +34,5 @@ def test_hashes_are_equal_for_equal_packets_alone(size: int, stride: int) -> Non
 
 def test_a_number_at_the_end_of_a_packet() -> None:
     packets = np.array([[9, 9, 9, 1, 2, 3]], np.uint8)
-    assert unsigned(packets, (3, 3)).tolist() == [0x030201]
-    assert unsigned(packets, (1, 3)).tolist() == [0x010909]
+    assert number(packets, 3, 3).tolist() == [0x030201]
+    assert number(packets, 1, 3).tolist() == [0x010909]

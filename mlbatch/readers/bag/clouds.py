@@ -15,7 +15,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from mlbatch.arrays import I64Array, U8Array
-from mlbatch.lidar.content_keys import hash_factors
+from mlbatch.lidar.headers import hash_factors
 from mlbatch.native.arena import PacketArena
 from mlbatch.readers.bag.cloud_topics import CloudTopics
 from mlbatch.ros.point_packets import HEAD, CloudError, Points, layout_of, pack

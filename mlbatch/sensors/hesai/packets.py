@@ -12,9 +12,7 @@ import numpy as np
 
 from mlbatch.arrays import BoolArray, F64Array, I64Array, U8Array
 from mlbatch.lidar.headers import DatedGroups, checks
-from mlbatch.lidar.interface import Records
-from mlbatch.lidar.pixel_table import PixelTable, readings
-from mlbatch.sensors.crc import crc32
+from mlbatch.lidar.interface import PixelTable, Records, readings
 from mlbatch.sensors.hesai.firing import NEVER
 from mlbatch.sensors.hesai.layout import (
     CRC_SIZE,
@@ -134,6 +132,8 @@ def first_azimuths(packets: U8Array, layout: Layout) -> F64Array:
 
 def wrong_crc(packets: U8Array, layout: Layout) -> BoolArray:
     """(P,) whether a checksum of packets is wrong."""
+    from mlbatch.sensors.crc import crc32
+
     body = packets[:, layout.prefix :]
     wrong = np.zeros(len(body), np.bool_)
     parts = []

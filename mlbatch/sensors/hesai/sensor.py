@@ -15,18 +15,15 @@ import numpy as np
 
 from mlbatch.arrays import F64Array, median
 from mlbatch.errors import RigError
-from mlbatch.lidar.geometry import BeamTable, spherical
+from mlbatch.lidar.geometry import BeamTable, Projection, spherical
 from mlbatch.lidar.headers import HeaderReader
 from mlbatch.lidar.interface import Calibration, Evidence, SensorModel
-from mlbatch.lidar.projections import Projection
 from mlbatch.sensors.base import BaseLidar
 from mlbatch.sensors.hesai import models as rows
 from mlbatch.sensors.hesai.angles import At128File, HesaiAngles, read_angles, read_at128
-from mlbatch.sensors.hesai.at128 import at128_projection
 from mlbatch.sensors.hesai.identify import describe, identify
 from mlbatch.sensors.hesai.layout import Layout
 from mlbatch.sensors.hesai.models import Model
-from mlbatch.sensors.hesai.optics import axis_ranges, off_axis
 from mlbatch.sensors.hesai.packets import (
     firing_tables,
     first_azimuths,
@@ -35,6 +32,7 @@ from mlbatch.sensors.hesai.packets import (
     records_of,
     wrong_crc,
 )
+from mlbatch.sensors.hesai.projections import at128_projection, axis_ranges, off_axis
 from mlbatch.sensors.nominal import apart_deg, refuse_other_beams
 from mlbatch.sensors.options import check_options
 from mlbatch.units import M_PER_MM, RAD_PER_DEG

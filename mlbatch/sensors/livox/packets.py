@@ -16,8 +16,8 @@ import numpy as np
 import numpy.typing as npt
 
 from mlbatch.arrays import BoolArray, F32Array, F64Array, U8Array
+from mlbatch.lidar.geometry import Coordinates
 from mlbatch.lidar.headers import EvenColumns, checks
-from mlbatch.lidar.projections import Coordinates
 from mlbatch.types import ImuSamples
 from mlbatch.units import RAD_PER_DEG, STANDARD_GRAVITY
 

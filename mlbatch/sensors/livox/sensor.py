@@ -15,10 +15,9 @@ import numpy as np
 
 from mlbatch.arrays import F64Array, I64Array, U8Array, median
 from mlbatch.errors import RigError
-from mlbatch.lidar.geometry import BeamTable
+from mlbatch.lidar.geometry import BeamTable, Coordinates
 from mlbatch.lidar.headers import HeaderReader
 from mlbatch.lidar.interface import Calibration, Evidence, Records, SensorModel
-from mlbatch.lidar.projections import Coordinates
 from mlbatch.sensors.base import BaseLidar
 from mlbatch.sensors.livox.identify import describe, identify
 from mlbatch.sensors.livox.packets import (

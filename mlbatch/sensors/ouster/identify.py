@@ -17,7 +17,7 @@ from mlbatch.sensors.ouster.imu import (
     float64,
     sample_count,
 )
-from mlbatch.sensors.ouster.packets import column_bytes, unsigned
+from mlbatch.sensors.ouster.packets import column_bytes
 from mlbatch.sensors.ouster.profiles import (
     COLUMN,
     ENCODER_TICKS,
@@ -34,7 +34,7 @@ from mlbatch.sensors.ouster.profiles import (
     ZONE_PACKET,
     PacketLayout,
 )
-from mlbatch.sensors.packet_bytes import payload_rows
+from mlbatch.sensors.packet_bytes import number, payload_rows
 from mlbatch.units import NS_PER_S, STANDARD_GRAVITY
 
 _COLUMNS = 16
@@ -137,13 +137,13 @@ def _like_gravity(acceleration_g: F64Array) -> bool:
 
 def _header_type(packets: U8Array, packet_type: int) -> str | None:
     for header in (STANDARD, FUSA):
-        if (unsigned(packets, HEADERS[header].packet_type) == packet_type).all():
+        if (number(packets, *HEADERS[header].packet_type) == packet_type).all():
             return header
     return None
 
 
 def _serial(packets: U8Array, header: str) -> str:
-    serial = int(unsigned(packets, HEADERS[header].serial)[0])
+    serial = int(number(packets, *HEADERS[header].serial)[0])
     return f"serial {serial}, " if serial else ""
 
 

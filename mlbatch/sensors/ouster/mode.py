@@ -14,7 +14,7 @@ import numpy as np
 from mlbatch.arrays import F64Array, I64Array, U8Array, median
 from mlbatch.errors import RigError
 from mlbatch.sensors.ouster.metadata import REMEDY, Metadata
-from mlbatch.sensors.ouster.packets import Headers, LegacyHeaders
+from mlbatch.sensors.ouster.packets import Headers
 from mlbatch.sensors.ouster.profiles import ENCODER_TICKS
 from mlbatch.types import ColumnHeaders
 from mlbatch.units import NS_PER_S, NS_PER_US
@@ -102,10 +102,10 @@ def seen_in(described: Metadata, headers: Headers, packets: U8Array, found: Colu
     rows = np.flatnonzero(has)
     stamp_ns = found.stamp_ns[rows, first[rows]]
     first_id = mid[rows, first[rows]]
-    if isinstance(headers, LegacyHeaders):
+    if headers.layout.legacy:
         counted = _columns_by_encoder(headers.encoders(packets)[valid], mid[valid])
     else:
-        frame = headers.frame_ids(packets)[rows]
+        frame = headers.read(packets, "frame_id")[rows]
         counted = _columns_by_frames(frame, stamp_ns, first_id, each_ns)
     return Seen(counted, each_ns, int(mid[valid].max()), float(beyond[has].mean()))
 

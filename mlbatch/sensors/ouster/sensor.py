@@ -30,13 +30,7 @@ from mlbatch.sensors.ouster.imu import (
 )
 from mlbatch.sensors.ouster.metadata import REMEDY, Metadata, parse_metadata, read_document
 from mlbatch.sensors.ouster.mode import Seen, as_sent, seen_in
-from mlbatch.sensors.ouster.packets import (
-    Headers,
-    LegacyHeaders,
-    PacketHeaders,
-    wrong_crc,
-)
-from mlbatch.sensors.ouster.pixels import pixel_table
+from mlbatch.sensors.ouster.packets import Headers, pixel_table, wrong_crc
 from mlbatch.sensors.ouster.profiles import FUSA, LEGACY, STANDARD
 from mlbatch.types import ImuSamples
 from mlbatch.units import NS_PER_S
@@ -159,7 +153,7 @@ class OusterCalibration:
     def _other_init_id(self, packets: U8Array) -> Iterator[str]:
         """A note if packets carry another initialization id than the metadata."""
         expected = self.metadata.init_id
-        seen = set(self._headers.init_ids(packets).tolist()) - {0}
+        seen = set(self._headers.read(packets, "init_id").tolist()) - {0}
         if expected and seen and expected not in seen:
             yield (
                 f"{self.path}: Ouster metadata: expected packets of initialization_id {expected}, "
@@ -170,8 +164,8 @@ class OusterCalibration:
     def _ids_fit(self, packets: U8Array) -> int:
         serial = self.metadata.serial
         init_id = self.metadata.init_id
-        same_unit = serial != 0 and bool((self._headers.serials(packets) == serial).any())
-        same_init = init_id != 0 and bool((self._headers.init_ids(packets) == init_id).any())
+        same_unit = serial != 0 and bool((self._headers.read(packets, "serial") == serial).any())
+        same_init = init_id != 0 and bool((self._headers.read(packets, "init_id") == init_id).any())
         return _FITS_SERIAL * same_unit + _FITS_INIT_ID * same_init
 
     def _ports_fit(self, evidence: Evidence) -> int:
@@ -283,11 +277,9 @@ def beam_table(described: Metadata) -> BeamTable:
 
 
 def _headers(described: Metadata) -> Headers:
-    layout = described.layout
-    columns = described.columns_per_frame
-    if layout.legacy:
-        return LegacyHeaders(layout, columns)
-    return PacketHeaders(layout, columns, described.header, described.serial)
+    return Headers(
+        described.layout, described.columns_per_frame, described.header, described.serial
+    )
 
 
 def _column_period_ns(described: Metadata) -> float:

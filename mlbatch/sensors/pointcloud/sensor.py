@@ -16,10 +16,9 @@ import numpy as np
 
 from mlbatch.arrays import F64Array, U8Array
 from mlbatch.errors import RigError
-from mlbatch.lidar.geometry import BeamTable
+from mlbatch.lidar.geometry import BeamTable, PlacedPoints
 from mlbatch.lidar.headers import EvenColumns, HeaderReader, check_of, checks
 from mlbatch.lidar.interface import Calibration, Evidence, Lidar, Records, SensorModel
-from mlbatch.lidar.projections import PlacedPoints
 from mlbatch.ros.point_packets import HEAD, KINDS, MAGIC, MOST_SLOTS, REALS, VERSION, Layout
 from mlbatch.sensors.base import BaseLidar
 from mlbatch.sensors.options import check_options

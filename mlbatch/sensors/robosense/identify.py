@@ -13,6 +13,7 @@ import numpy as np
 from mlbatch.arrays import BoolArray, I64Array, U8Array
 from mlbatch.sensors.packet_bytes import (
     NO_DECODER,
+    US_PER_MINUTE,
     block_azimuths,
     block_time_us,
     has_bytes,
@@ -24,14 +25,14 @@ from mlbatch.sensors.packet_bytes import (
 )
 from mlbatch.sensors.robosense import models as rows
 from mlbatch.sensors.robosense.models import DIFOP, SECOND_KIND, VENDOR, Layout, Model
-from mlbatch.sensors.robosense.packets import in_time_form
+from mlbatch.sensors.robosense.packets import in_time_form, times_ns
+from mlbatch.units import NS_PER_US
 
 _SOLID_STATE = bytes.fromhex("55aa5aa5")
 _IMU = bytes.fromhex("aa555a05")
 _IMU_SIZE = 51
 # Bytes of type and model, which sources place differently (section 2).
 _TYPE_BYTES = (30, 31, 32)
-_MINUTE_US = 60_000_000
 _PACE_TOLERANCE = 0.1
 _SOLID_SIZES = {1210: "M1", 1342: "M2", 1448: "M3", 1404: "MX", 1200: "E1", 812: "EM"}
 
@@ -222,7 +223,8 @@ def returns_of(packets: U8Array, model: Model) -> int:
         is_dual = in_pairs(azimuth) if layout.blocks % 2 == 0 else _repeats(azimuth)
         return 1 + is_dual if is_moving else 0
     # A block has one round of two returns, or two rounds of one.
-    took_us = block_time_us(_stamp_us(chosen, model), azimuth, _MINUTE_US)
+    stamp_ns, _ = times_ns(chosen, model)
+    took_us = block_time_us(stamp_ns // NS_PER_US % US_PER_MINUTE, azimuth, US_PER_MINUTE)
     for returns in (1, 2):
         expected_us = model.rounds_per_block / returns * model.round_ns / 1000
         if took_us is not None and abs(took_us - expected_us) < _PACE_TOLERANCE * expected_us:
@@ -233,18 +235,6 @@ def returns_of(packets: U8Array, model: Model) -> int:
 def _repeats(azimuth: I64Array) -> bool:
     """Whether most packets have a pair of equal azimuths, with an odd number of blocks."""
     return float((azimuth[:, 1:] == azimuth[:, :-1]).any(axis=1).mean()) > 0.75
-
-
-def _stamp_us(packets: U8Array, model: Model) -> I64Array:
-    """(k,) time within the minute, us."""
-    at = model.layout.time_at
-    if model.is_calendar:
-        second = number(packets, at + 5, 1)
-        milli, micro = (number(packets, at + offset, 2, ">") for offset in (6, 8))
-        return second * 1_000_000 + milli * 1000 + micro
-    second = number(packets, at, 6, ">")
-    micro = number(packets, at + 6, 4, ">")
-    return np.asarray((second % 60) * 1_000_000 + micro, np.int64)
 
 
 def _lidar(model: str, mode: str = "") -> str:

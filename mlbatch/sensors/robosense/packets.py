@@ -12,9 +12,8 @@ import numpy as np
 
 from mlbatch.arrays import BoolArray, I64Array, U8Array, median
 from mlbatch.lidar.headers import TimedRows, check_of, checks
-from mlbatch.lidar.interface import Records
-from mlbatch.lidar.pixel_table import PixelTable, readings
-from mlbatch.sensors.packet_bytes import majority, number
+from mlbatch.lidar.interface import PixelTable, Records, readings
+from mlbatch.sensors.packet_bytes import block_azimuths, has_bytes, majority, number
 from mlbatch.sensors.robosense.models import DIFOP, READING, Model
 from mlbatch.units import NS_PER_S, NS_PER_US
 
@@ -193,12 +192,12 @@ def pixels(model: Model, shape: Shape, units_per_m: int) -> PixelTable:
 def _azimuths(packets: U8Array, model: Model, shape: Shape) -> tuple[I64Array, BoolArray]:
     """Azimuths of the rows (P, rows), 0.01 degree, and whether the rows are valid."""
     layout = model.layout
-    at = layout.header + layout.stride * shape.row_blocks * np.arange(shape.rows)
-    azimuth = packets[:, at + 2].astype(np.int64) << 8 | packets[:, at + 3]
+    stride = layout.stride * shape.row_blocks
+    azimuth = block_azimuths(packets, layout.header, stride, shape.rows, ">")
     # Sensors round the last angles of a revolution up to 360 degrees.
     good = azimuth <= _CDEG_PER_REVOLUTION
-    for place, byte in enumerate(layout.block_id):
-        good &= packets[:, at + place] == byte
+    for row in range(shape.rows):
+        good[:, row] &= has_bytes(packets, layout.block_id, layout.header + stride * row)
     return azimuth % _CDEG_PER_REVOLUTION, good
 
 

@@ -100,7 +100,6 @@ class Layout:
     sequences: int
     columns: int
     records: Records
-    lasers_per_bank: int
     first_byte: tuple[tuple[int, ...], ...]
 
 
@@ -118,7 +117,7 @@ def layout(model: Model, returns: int) -> Layout:
     )
     step = _READING * BLOCK_LASERS // model.halves
     records = Records(_BLOCK_HEAD, STRIDE * blocks, size, model.halves, step)
-    return Layout(blocks, sequences, sequences * model.halves, records, per_bank, first_byte)
+    return Layout(blocks, sequences, sequences * model.halves, records, first_byte)
 
 
 @lru_cache(maxsize=8)

@@ -14,6 +14,7 @@ import numpy as np
 
 from mlbatch.arrays import median
 from mlbatch.errors import RigError
+from mlbatch.lidar.headers import HeaderReader
 from mlbatch.lidar.interface import NAMED_ONLY, Calibration, Evidence, SensorModel
 from mlbatch.sensors.options import check_options
 from mlbatch.sensors.velodyne.calibration import VelodyneFile, read_velodyne
@@ -31,8 +32,8 @@ from mlbatch.sensors.velodyne.packets import (
     Measured,
     Options,
     VelodyneLidar,
-    are_good,
     first_azimuths,
+    header_table,
     mean_step,
     steps,
 )
@@ -231,7 +232,9 @@ def _measure(row: Model, evidence: Evidence | None) -> tuple[Measured, list[str]
     where = layout(row, seen.returns)
     packets = evidence.sample
     host_ns = evidence.host_ns
-    good = are_good(packets, row, seen.returns)
+    first = Measured(seen.mode, row.sequence_ns)
+    table = header_table(row, where, first, Options(), row.firing_ns(row.sequence_ns))
+    good = HeaderReader(table, has_number=False).read_rows(packets).faults == 0
     packets = packets[good]
     host_ns = host_ns[good]
     stamp_ns = top_of_hour_ns(packets)

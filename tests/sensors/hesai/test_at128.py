@@ -11,7 +11,7 @@ import pytest
 from mlbatch.arrays import F64Array, I64Array
 from mlbatch.lidar.geometry import rotor_words
 from mlbatch.sensors.hesai.angles import At128File
-from mlbatch.sensors.hesai.at128 import at128_projection
+from mlbatch.sensors.hesai.projections import at128_projection
 from tests.builders.decoded import Rotor, projected
 
 DEG = math.pi / 180

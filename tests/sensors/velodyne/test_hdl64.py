@@ -12,7 +12,7 @@ import pytest
 from mlbatch.arrays import F32Array, F64Array, I64Array
 from mlbatch.lidar.geometry import rotor_words
 from mlbatch.sensors.velodyne.calibration import VelodyneFile, read_velodyne
-from mlbatch.sensors.velodyne.hdl64 import hdl64_projection
+from mlbatch.sensors.velodyne.packets import hdl64_projection
 from mlbatch.simulate.velodyne.models import calibration_yaml
 from tests.builders.decoded import Rotor, projected
 
