@@ -83,24 +83,26 @@ def rigid(matrix: F64Array) -> F64Array:
     return _joined(_nearest_rotation(rotation), matrix[:3, 3])
 
 
-def quaternion(matrix: F64Array) -> F64Array:
-    """Return the unit quaternion (4,) x, y, z, w of a transform, with w >= 0."""
-    m = matrix
-    # Four times the outer product of the quaternion with itself; its longest row is most accurate.
-    outer = np.array(
+def quaternion(matrix: F64Array) -> tuple[float, float, float, float]:
+    """Return the unit quaternion (x, y, z, w), w >= 0, of a rotation (3, 3) or a transform (4, 4).
+
+    K = 4 q q^T is linear in the rotation; its row with the largest diagonal is q up to a factor
+    and far from 0 (S. W. Shepperd, "Quaternion from rotation matrix", 1978).
+    """
+    (a, b, c), (d, e, f), (g, h, i) = matrix[:3, :3].tolist()
+    product = np.array(
         [
-            [1 + m[0, 0] - m[1, 1] - m[2, 2], m[0, 1] + m[1, 0], m[0, 2] + m[2, 0], 0.0],
-            [m[0, 1] + m[1, 0], 1 - m[0, 0] + m[1, 1] - m[2, 2], m[1, 2] + m[2, 1], 0.0],
-            [m[0, 2] + m[2, 0], m[1, 2] + m[2, 1], 1 - m[0, 0] - m[1, 1] + m[2, 2], 0.0],
-            [0.0, 0.0, 0.0, 1 + m[0, 0] + m[1, 1] + m[2, 2]],
+            [1 + a - e - i, b + d, c + g, h - f],
+            [b + d, 1 - a + e - i, f + h, c - g],
+            [c + g, f + h, 1 - a - e + i, d - b],
+            [h - f, c - g, d - b, 1 + a + e + i],
         ]
     )
-    outer[3, :3] = (m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1])
-    outer[:3, 3] = outer[3, :3]
-    row: F64Array = outer[int(np.argmax(np.diagonal(outer)))]
-    x, y, z, w = (float(value) for value in row)
-    sign = -1.0 if (w, x, y, z) < (0.0, 0.0, 0.0, 0.0) else 1.0
-    return row * (sign / math.sqrt(x * x + y * y + z * z + w * w))
+    row = product[int(np.argmax(np.diagonal(product)))]
+    x, y, z, w = (row / np.sqrt((row * row).sum())).tolist()
+    # Adding 0.0 changes -0.0 to 0.0, so that equal poses give equal bytes.
+    sign = -1.0 if w < 0 else 1.0
+    return sign * x + 0.0, sign * y + 0.0, sign * z + 0.0, sign * w + 0.0
 
 
 def rpy_deg(matrix: F64Array) -> tuple[float, float, float]:

@@ -214,7 +214,7 @@ class FrameTree:
 
 def difference(first: F64Array, second: F64Array) -> tuple[float, float]:
     """Return the distance of two poses of one frame in m, and the angle between them in rad."""
-    x, y, z, w = quaternion(compose(inverse(first), second)).tolist()
+    x, y, z, w = quaternion(compose(inverse(first), second))
     return math.dist(first[:3, 3], second[:3, 3]), 2 * math.atan2(math.hypot(x, y, z), w)
 
 

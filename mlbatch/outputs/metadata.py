@@ -7,6 +7,7 @@ from dataclasses import dataclass, fields, replace
 
 from mlbatch.bounded import parse_json
 from mlbatch.outputs.damage import CheckLog
+from mlbatch.types import VARIANTS
 
 # Python refuses very long numbers.
 _MOST_DIGITS = 19
@@ -58,7 +59,6 @@ class RunMetadata:
         return found
 
 
-VARIANTS = ("batching", "batching_times", "stamp", "deskew", "deskew_to")
 _VARIANT_WORDS = {
     "batching": ("latest", "approximate", "collate"),
     "batching_times": ("common", "own"),

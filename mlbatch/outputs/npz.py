@@ -21,8 +21,9 @@ from mlbatch.arrays import F32Array, I64Array, U8Array, U16Array, U32Array
 from mlbatch.outputs.containers import check_unpacked_size, library_errors
 from mlbatch.outputs.damage import CheckLog, DamageError
 from mlbatch.outputs.folders import ScanFile, readable
-from mlbatch.outputs.metadata import VARIANTS, RunMetadata, with_variants
+from mlbatch.outputs.metadata import RunMetadata, with_variants
 from mlbatch.outputs.stored_scan import StoredScan
+from mlbatch.types import VARIANTS
 
 SUFFIX = ".npz"
 SCHEMA = "mlbatch.scan/1"

@@ -134,7 +134,7 @@ def static_message(stamp_ns: int, parent: str, child: str, parent_from_child: F6
     message.header(stamp_ns, parent)
     message.text(child)
     message.put("d", *parent_from_child[:3, 3].tolist())
-    message.put("d", *quaternion(parent_from_child[:3, :3]).tolist())
+    message.put("d", *quaternion(parent_from_child))
     return bytes(message.data)
 
 
@@ -145,7 +145,7 @@ def transform_message(stamp_ns: int, parent: str, child: str, poses: Poses, row:
     message.header(stamp_ns, parent)
     message.text(child)
     message.put("d", *poses.position_m[row].tolist())
-    message.put("d", *quaternion(poses.rotation[row]).tolist())
+    message.put("d", *quaternion(poses.rotation[row]))
     return bytes(message.data)
 
 
@@ -155,7 +155,7 @@ def odometry_message(stamp_ns: int, parent: str, child: str, poses: Poses, row: 
     message.header(stamp_ns, parent)
     message.text(child)
     message.put("d", *poses.position_m[row].tolist())
-    message.put("d", *quaternion(poses.rotation[row]).tolist(), *(0.0,) * 36)
+    message.put("d", *quaternion(poses.rotation[row]), *(0.0,) * 36)
     message.put("d", *(poses.rotation[row].T @ poses.velocity[row]).tolist())
     message.put("d", *poses.angular_velocity[row].tolist(), *(0.0,) * 36)
     return bytes(message.data)

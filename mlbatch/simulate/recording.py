@@ -282,7 +282,7 @@ class _Run:
         ]
 
     def _write_pose(self, host_ns: int, poses: Poses, row: int) -> None:
-        values = (*poses.position_m[row].tolist(), *quaternion(poses.rotation[row]).tolist())
+        values = (*poses.position_m[row].tolist(), *quaternion(poses.rotation[row]))
         text = " ".join(f"{value:.9f}" for value in values)
         second, rest_ns = divmod(host_ns, NS_PER_S)
         self._truth.write(f"{second}.{rest_ns:09d} {text}\n")

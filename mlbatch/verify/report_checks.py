@@ -13,7 +13,8 @@ from mlbatch.arrays import BoolArray, F64Array, I64Array
 from mlbatch.bounded import MOST_TABLE_BYTES, parse_json, read_text
 from mlbatch.errors import UsageError
 from mlbatch.outputs.damage import CheckLog, VerifyError
-from mlbatch.outputs.metadata import VARIANTS, RunMetadata, with_variants
+from mlbatch.outputs.metadata import RunMetadata, with_variants
+from mlbatch.types import VARIANTS
 from mlbatch.units import parse_rate
 from mlbatch.verify.scan_checks import Grid
 from mlbatch.verify.table import OutputTotals, Table, read_table

@@ -18,6 +18,7 @@ from isal.isal_zlib import crc32
 
 from mlbatch.arrays import F64Array
 from mlbatch.errors import ExportError, UsageError
+from mlbatch.frames.transforms import quaternion
 from mlbatch.ros.definitions import FIELD_CODES
 from mlbatch.ros.encoding import Wire
 from mlbatch.types import (
@@ -477,25 +478,3 @@ def _refuse_same_frames(target: Path, info: RunInfo) -> None:
                 f"{target}: expected frames of different names, found {frame} for a sensor and for "
                 "an IMU or the body; rename the sensor or body_frame in the rig"
             )
-
-
-def quaternion(rotation: F64Array) -> tuple[float, float, float, float]:
-    """Return the unit quaternion (x, y, z, w), w >= 0, of a rotation (3, 3).
-
-    K = 4 q q^T is linear in the rotation; its row with the largest diagonal is q up to a factor
-    and far from 0 (S. W. Shepperd, "Quaternion from rotation matrix", 1978).
-    """
-    (a, b, c), (d, e, f), (g, h, i) = rotation.tolist()
-    product = np.array(
-        [
-            [1 + a - e - i, b + d, c + g, h - f],
-            [b + d, 1 - a + e - i, f + h, c - g],
-            [c + g, f + h, 1 - a - e + i, d - b],
-            [h - f, c - g, d - b, 1 + a + e + i],
-        ]
-    )
-    row = product[int(np.argmax(np.diagonal(product)))]
-    x, y, z, w = (row / np.sqrt((row * row).sum())).tolist()
-    # Adding 0.0 changes -0.0 to 0.0, so that equal poses give equal bytes.
-    sign = -1.0 if w < 0 else 1.0
-    return sign * x + 0.0, sign * y + 0.0, sign * z + 0.0, sign * w + 0.0

@@ -498,7 +498,7 @@ POSES = st.builds(
 
 
 def _transform(parent: str, child: str, matrix: F64Array) -> Transform:
-    return parent, child, matrix[:3, 3].tolist(), quaternion(matrix).tolist()
+    return parent, child, matrix[:3, 3].tolist(), list(quaternion(matrix))
 
 
 @given(POSES, POSES)

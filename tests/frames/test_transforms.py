@@ -177,7 +177,7 @@ def test_transforms_keep_distances(
 @example(from_rpy_deg(ORIGIN, (180.0, 0.0, 180.0)))
 def test_quaternion_and_angles_give_the_matrix_again(matrix: F64Array) -> None:
     translation = matrix[:3, 3].tolist()
-    xyzw = quaternion(matrix)
+    xyzw = np.array(quaternion(matrix))
     assert xyzw[3] >= 0
     assert float((xyzw**2).sum()) == pytest.approx(1.0, abs=1e-14)
     np.testing.assert_allclose(from_quaternion(translation, xyzw.tolist()), matrix, atol=1e-14)

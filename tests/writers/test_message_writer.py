@@ -10,10 +10,11 @@ import numpy as np
 import pytest
 
 from mlbatch.errors import ExportError
+from mlbatch.frames.transforms import quaternion
 from mlbatch.ros.encoding import Cdr
 from mlbatch.types import IMU, PACKED_ROOM, Message, PackedPoints, Summary
 from mlbatch.writers import WriterOptions, extras, format_names, open_writer, plugin
-from mlbatch.writers.message_writer import CloudMessage, quaternion, static_edges
+from mlbatch.writers.message_writer import CloudMessage, static_edges
 from mlbatch.writers.point_layouts import CLOUD_LAYOUTS
 from tests.builders.scans import (
     PERIOD_NS,

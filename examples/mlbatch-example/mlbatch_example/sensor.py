@@ -17,8 +17,15 @@ import numpy.typing as npt
 from mlbatch.arrays import BoolArray, I64Array, U8Array
 from mlbatch.errors import RigError
 from mlbatch.lidar.geometry import BeamTable, spherical
-from mlbatch.lidar.interface import FAULTS, Calibration, Evidence, Records, SensorModel
-from mlbatch.lidar.pixel_table import PixelTable, readings
+from mlbatch.lidar.interface import (
+    FAULTS,
+    Calibration,
+    Evidence,
+    PixelTable,
+    Records,
+    SensorModel,
+    readings,
+)
 from mlbatch.sensors.base import BaseLidar
 from mlbatch.types import ColumnHeaders
 
