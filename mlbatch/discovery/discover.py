@@ -441,7 +441,7 @@ class Refusal(NamedTuple):
     alone: str
 
 
-# By cause; where there is no sensor at all, the first of these that occurs is told.
+# By cause; where there is no sensor at all, the first of these that occurs is stated.
 _REFUSALS = {
     "unusable": Refusal(
         "no_metadata",
