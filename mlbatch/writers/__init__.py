@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, NamedTuple
 
 from mlbatch.errors import UsageError
+from mlbatch.options import PLY_STYLES
 from mlbatch.writers.atomic import (
     FILES_JSONL,
     REPORT_JSON,
@@ -49,9 +50,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
     from pathlib import Path
 
-    from mlbatch.options import PLY_STYLES
-from mlbatch.options import PLY_STYLES
-from mlbatch.types import RecordLayout, RunInfo
+    from mlbatch.types import RecordLayout, RunInfo
 
 __all__ = [
     "FILES_JSONL",

@@ -54,7 +54,7 @@ READ = {
     "golden": ("digest out --against {}", "golden file"),
     "report": ("report {}", "readable file"),
     "report of an output": ("report out --report {}", "readable file"),
-    "verified": ("verify {}", "readable file"),
+    "verified": ("verify {}", "output of `mlbatch convert`"),
     "digested": ("digest {}", "output of `mlbatch convert`"),
     "manifest": ("batch {}.yaml -o sessions", "readable file"),
     "scenario": ("simulate {}.yaml -o x.pcap", "scenario file"),
@@ -237,7 +237,7 @@ def test_reports_are_read_from_standard_input_up_to_a_limit(
 UNSET = "expected a path, found an empty word; check that the variable of the shell is set"
 WORDS = {
     "input": (f"convert '' -r {RIG} --dry-run", 2, f"RECORDINGS: {UNSET}"),
-    "output": (f"convert {PAIR} -o ''", 2, f"-o: {UNSET}"),
+    "output": (f"convert {PAIR} -o ''", 2, f"--output: {UNSET}"),
     "rig": (f"inspect {CAPTURE} -r ''", 2, f"--rig: {UNSET}"),
     "verified": ("verify ''", 2, f"OUTPUT: {UNSET}"),
     "link to itself as output": (
