@@ -9,6 +9,7 @@ import warnings
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
 from fractions import Fraction
+from numbers import Real
 from os import PathLike, fspath
 from pathlib import Path
 from typing import Any, Literal, TypeAlias, TypedDict, TypeVar
@@ -228,10 +229,10 @@ def window_job(job: Job, options: RatedOptions, shown: Callable[[str], str] = _a
     layout = choice(shown("layout"), options.get("layout", "dense"), LAYOUTS)
     rate = options.get("rate")
     deskew_to = options.get("deskew_to")
-    low = options.get("min_range", 0.0)
-    high = options.get("max_range", math.inf)
+    low = _number(shown("min_range"), options.get("min_range", 0.0))
+    high = _number(shown("max_range"), options.get("max_range", math.inf))
     check_ranges_m(shown("min_range"), low, shown("max_range"), high)
-    drop_incomplete = options.get("drop_incomplete", 0.0)
+    drop_incomplete = _number(shown("drop_incomplete"), options.get("drop_incomplete", 0.0))
     if not 0 <= drop_incomplete <= 100:
         raise UsageError(
             f"{shown('drop_incomplete')}: expected a share from 0 to 100 %, found "
@@ -274,13 +275,22 @@ def read_wait_ns(option: str, given: float | str) -> int | None:
     """`--max-wait`: seconds, or inf; None: infinite."""
     try:
         seconds = float(given)
-    except ValueError:
+    except (TypeError, ValueError):
         seconds = math.nan
     return wait_ns(option, seconds, given)
 
 
+def _number(option: str, value: object) -> float:
+    if isinstance(value, bool) or not isinstance(value, Real):
+        raise UsageError(f"{option}: expected a number, found {value!r}; correct it")
+    return float(value)
+
+
 def _box(values: Box) -> tuple[float, ...]:
-    box = tuple(map(float, values)) if isinstance(values, Iterable) else ()
+    try:
+        box = tuple(map(float, values)) if isinstance(values, Iterable) else ()
+    except (TypeError, ValueError):
+        box = ()
     if len(box) != _BOX_VALUES or not all(a < b for a, b in zip(box[:3], box[3:], strict=True)):
         raise UsageError(
             "exclude_boxes: expected (x0, y0, z0, x1, y1, z1) in metres with x0 < x1, y0 < y1, "

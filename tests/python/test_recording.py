@@ -283,10 +283,16 @@ def test_packets_of_no_sensor(rec: Recording) -> None:
         ({"drop_incomplete": 101}, "drop_incomplete: expected a share from 0 to 100 %"),
         ({"exclude_boxes": [(0, 0, 0, 1, 1)]}, "exclude_boxes: expected"),
         ({"min_range": math.nan}, "min_range: expected 0 or more metres"),
+        ({"min_range": "0.5"}, "min_range: expected a number, found '0.5'"),
+        ({"max_range": None}, "max_range: expected a number, found None"),
+        ({"drop_incomplete": True}, "drop_incomplete: expected a number, found True"),
+        ({"max_wait": "never"}, "max_wait: expected seconds above 0, or inf, found 'never'"),
+        ({"max_wait": None}, "max_wait: expected seconds above 0, or inf, found None"),
+        ({"exclude_boxes": [("a", "b")]}, "exclude_boxes: expected"),
         ({"start": "+2", "end": "+1"}, "end: expected a time after start"),
     ],
 )
-def test_impossible_values(options: dict[str, float | str], expected: str, rec: Recording) -> None:
+def test_impossible_values(options: dict[str, object], expected: str, rec: Recording) -> None:
     with pytest.raises(UsageError, match=expected):
         rec.scans(**options)  # type: ignore[arg-type]
 
