@@ -1,4 +1,4 @@
-"""Poses of the body at any time, and the transforms that move columns to one instant."""
+"""Poses of the body at any time."""
 
 from __future__ import annotations
 
@@ -73,52 +73,3 @@ class PoseTrack:
         position[rows] += self.position_m[after[rows] - 1]
         known[rows] = True
         return Poses(rotation, position, known)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class ColumnMotion:
-    """Transforms of n columns into the body frame at one instant; identity without a pose.
-
-    rotation: (n, 3, 3); translation_m: (n, 3); no_pose: (n,).
-    """
-
-    rotation: F64Array
-    translation_m: F64Array
-    no_pose: BoolArray
-
-
-def column_motion(track: PoseTrack, stamp_ns: I64Array, to_ns: int) -> ColumnMotion:
-    """Return the transforms of columns (n,) to the pose at `to_ns`.
-
-    All columns are without a pose if there is none at `to_ns`.
-    """
-    target = track.at(np.array([to_ns], np.int64))
-    poses = track.at(stamp_ns)
-    count = len(stamp_ns)
-    no_pose = ~poses.known if target.known[0] else np.ones(count, np.bool_)
-    back = target.rotation[0].T
-    rotation = np.matmul(back, poses.rotation)
-    translation = (poses.position_m - target.position_m[0]) @ back.T
-    rotation[no_pose] = np.eye(3)
-    translation[no_pose] = 0.0
-    return ColumnMotion(rotation, translation, no_pose)
-
-
-def constant_twist(
-    stamp_ns: int, velocity: F64Array, angular_velocity: F64Array, lasts_ns: int
-) -> PoseTrack:
-    """Return a track of constant body velocities (3,), m/s and rad/s, from the origin at a time.
-
-    Its end is exact for any duration, since poses are interpolated on SE(3); the duration limits
-    how far the assumption reaches.
-    """
-    lasts_s = lasts_ns / NS_PER_S
-    vector = (angular_velocity * lasts_s)[None]
-    turn, step = exp_transform((velocity * lasts_s)[None], vector)
-    return PoseTrack(
-        np.array([stamp_ns, stamp_ns + lasts_ns]),
-        np.concatenate([np.eye(3)[None], turn]),
-        np.concatenate([np.zeros((1, 3)), step]),
-        "constant velocity",
-        lasts_ns,
-    )

@@ -10,7 +10,8 @@ from hypothesis import strategies as st
 from mlbatch.arrays import I64Array
 from mlbatch.motion.moves import PoseLine
 from mlbatch.motion.se3 import exp_rotation
-from mlbatch.motion.track import MAX_GAP_NS, PoseTrack, column_motion
+from mlbatch.motion.track import MAX_GAP_NS, PoseTrack
+from tests.reference.motion import column_motion
 
 S = 1_000_000_000
 MS = 1_000_000

@@ -8,13 +8,9 @@ import numpy as np
 import pytest
 
 from mlbatch.arrays import F64Array, I64Array
-from mlbatch.motion.track import (
-    MAX_GAP_NS,
-    PoseTrack,
-    column_motion,
-    constant_twist,
-)
+from mlbatch.motion.track import MAX_GAP_NS, PoseTrack
 from mlbatch.types import instant_ns
+from tests.reference.motion import column_motion
 
 S = 1_000_000_000
 
@@ -86,17 +82,6 @@ def test_columns_without_a_pose_stay() -> None:
     np.testing.assert_array_equal(motion.translation_m[[0, 3]], np.zeros((2, 3)))
     np.testing.assert_allclose(motion.rotation[2], np.eye(3), atol=1e-12)
     assert column_motion(track, stamps, 5 * S).no_pose.all()
-
-
-def test_constant_velocity_is_a_circle() -> None:
-    """2 m/s ahead and 1 rad/s to the left: 2 m around a centre 2 m to the left."""
-    track = constant_twist(S, np.array([2.0, 0, 0]), np.array([0, 0, 1.0]), 3 * S)
-    poses = track.at(np.array([S, 2 * S, 4 * S]))
-    assert poses.known.all()
-    time_s = np.array([0.0, 1.0, 3.0])
-    expected = np.column_stack([2 * np.sin(time_s), 2 - 2 * np.cos(time_s), 0 * time_s])
-    np.testing.assert_allclose(poses.position_m, expected, atol=1e-12)
-    np.testing.assert_allclose(poses.rotation, turns(time_s), atol=1e-12)
 
 
 @pytest.mark.parametrize(("word", "expected"), [("start", 100), ("middle", 150), ("end", 201)])

@@ -14,11 +14,12 @@ import pytest
 
 from mlbatch.arrays import F64Array
 from mlbatch.motion.imu import integrated
-from mlbatch.motion.track import PoseTrack, column_motion
+from mlbatch.motion.track import PoseTrack
 from mlbatch.motion.tum import read_tum
 from mlbatch.outputs.scan import Scan
 from mlbatch.types import instant_ns
 from tests.builders.simulated import Recorded, record, scenario_text
+from tests.reference.motion import column_motion
 
 WALL = 200
 MOTION = """\
