@@ -129,6 +129,11 @@ $(VENV)/docs.stamp: $(VENV)/dev.stamp
 	@$(BIN)/python -m pip $(INSTALL) --editable '.[docs]'
 	@touch $@
 
+$(VENV)/integrations.stamp: $(VENV)/dev.stamp
+	@echo "installing an S3 server and Snakemake for tests into $(VENV)"
+	@$(BIN)/python -m pip $(INSTALL) --editable '.[dev-integrations]'
+	@touch $@
+
 $(ODOMETRY)/odometry.stamp: examples/odometry/requirements.txt pyproject.toml $(SOURCES)
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { \
 		echo "make: expected Python 3.11 or later, which evo needs, found" \

@@ -20,8 +20,10 @@ from tests.batch.network import Network, s3_server
 from tests.batch.sessions import Dataset, Ended, run, scans, write_dataset
 from tests.builders.run import ROOT
 
+NEEDED = "needs the extra dev-integrations (an S3 server)"
 pytest.importorskip("obstore")
-pytest.importorskip("moto")
+pytest.importorskip("moto", reason=NEEDED)
+pytest.importorskip("flask_cors", reason=NEEDED)
 boto3: Any = importlib.import_module("boto3")
 
 NAMES = ["a1", "a2", "b1", "hopeless"]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import os
 import re
 import subprocess
@@ -16,8 +15,9 @@ from tests.builders.run import ROOT
 
 RULE = re.compile(r"^Snakemake:\n\n```text\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 
+pytest.importorskip("snakemake", reason="needs the extra dev-integrations (Snakemake)")
 
-@pytest.mark.skipif(importlib.util.find_spec("snakemake") is None, reason="needs snakemake")
+
 def test_the_rule_of_the_page_runs(tmp_path: Path) -> None:
     (rule,) = RULE.findall((ROOT / "docs" / "batch.md").read_text(encoding="utf-8"))
     assert len(rule.splitlines()) <= 12

@@ -22,6 +22,8 @@ from tests.contract.tree import PACKAGE, ROOT, modules
 Table: TypeAlias = dict[str, "Table | list[str] | str"]
 # Distributions whose module has another name.
 MODULE_OF = {"pyyaml": "yaml"}
+# Extras for work on the package.
+DEVELOPMENT = frozenset({"dev", "dev-integrations", "docs"})
 needs_compiler = pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler")
 
 
@@ -102,7 +104,7 @@ def test_the_lowest_versions_are_those_that_are_tested() -> None:
 def test_the_package_needs_exactly_what_it_imports() -> None:
     needed = _modules_of(cast(list[str], _settings("project")["dependencies"]))
     extras = _settings("project", "optional-dependencies")
-    lists = [cast(list[str], names) for extra, names in extras.items() if extra != "dev"]
+    lists = [cast(list[str], names) for extra, names in extras.items() if extra not in DEVELOPMENT]
     optional = {name for one in lists for name in _modules_of(one)}
     found = {_top(node) for module in modules() for node in ast.walk(module.tree)} - {""}
     # Only the type checker imports it, which brings it.
@@ -175,7 +177,7 @@ def test_nothing_installs_the_package_of_others() -> None:
 
 def test_every_extra_is_in_the_readme() -> None:
     """With the command that installs it from a clone."""
-    extras = set(_settings("project", "optional-dependencies")) - {"dev", "docs"}
+    extras = set(_settings("project", "optional-dependencies")) - DEVELOPMENT
     readme = (ROOT / "README.md").read_text(encoding="utf-8")
     assert "pip install '.[las]'" in readme
     assert extras <= set(re.findall(r"`(\w+)`", readme.partition("## Use")[0]))
