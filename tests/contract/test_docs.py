@@ -303,7 +303,7 @@ def test_every_module_is_on_the_map() -> None:
 
 def test_the_example_of_a_writer_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Saved in a folder of formats, as the page says, it is found and writes every point."""
-    (example,) = re.findall(r"^```python\n(.*?)^```$", _page("add-a-writer.md"), re.M | re.S)
+    (example,) = re.findall(r"^```python\n(.*?)^```$", _page("extend.md"), re.M | re.S)
     (tmp_path / "rawf32.py").write_text(example, encoding="utf-8")
     monkeypatch.setattr(formats, "__path__", [*formats.__path__, str(tmp_path)])
     writers.format_names.cache_clear()

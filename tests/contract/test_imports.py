@@ -6,7 +6,7 @@ import re
 
 import pytest
 
-from tests.contract.tree import PACKAGE, Module, imports, modules, plugins
+from tests.contract.tree import PACKAGE, ROOT, Module, imports, modules, plugins
 
 # From top to bottom: a package imports from its own modules and from lower floors.
 FLOORS: tuple[tuple[str, ...], ...] = (
@@ -38,6 +38,13 @@ NAMES = frozenset(module.name for module in MODULES)
 
 def test_every_package_has_its_floor() -> None:
     assert {module.top for module in MODULES} <= set(FLOOR)
+
+
+def test_the_map_draws_these_floors() -> None:
+    page = (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8")
+    (drawn,) = re.findall(r"^    (cli > .*?)\n\n", page, re.MULTILINE | re.DOTALL)
+    floors = [set(re.findall(r"\w+", floor)) for floor in drawn.split(">")]
+    assert floors == [set(names) - {""} for names in FLOORS[1:]]
 
 
 @pytest.mark.parametrize("module", MODULES, ids=lambda module: module.name or "mlbatch")

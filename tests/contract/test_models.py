@@ -1,6 +1,6 @@
 """Every supported model: what its vendor's module offers, an encoder, a case, the laws of `Lidar`.
 
-What is missing for a new one is named here; docs/add-a-sensor.md says where it goes.
+What is missing for a new one is named here; docs/extend.md says where it goes.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ from tests.builders.others import rows
 from tests.golden.test_every_model import CASES, ROBOSENSE_NAMES, Sent
 
 WORDS = ("real recording", "two sources", "one source")
-ADVICE = "see docs/add-a-sensor.md"
+ADVICE = "see docs/extend.md"
 SOURCE = "192.168.1.201"
 START_NS = 1_700_000_000_000_000_000
 # Rows of encoders that go by another name than the model, or are a second kind of its packets.

@@ -150,10 +150,12 @@ def test_the_example_is_listed(site: Path, tmp_path: Path) -> None:
     assert "rawf32" in done.stderr
 
 
-def test_the_pages_show_the_modules_of_the_example() -> None:
-    for page, module in (("add-a-reader.md", "framelog"), ("add-a-writer.md", "rawf32")):
-        text = (EXAMPLE / "mlbatch_example" / f"{module}.py").read_text(encoding="utf-8")
-        assert text in (ROOT / "docs" / page).read_text(encoding="utf-8")
+def test_the_page_shows_or_names_the_modules_of_the_example() -> None:
+    page = (ROOT / "docs" / "extend.md").read_text(encoding="utf-8")
+    assert (EXAMPLE / "mlbatch_example" / "rawf32.py").read_text(encoding="utf-8") in page
+    for module in ("framelog", "sensor"):
+        assert (EXAMPLE / "mlbatch_example" / f"{module}.py").is_file()
+        assert f"`mlbatch_example/{module}.py`" in page
 
 
 # -- mistakes -------------------------------------------------------------------------------------
