@@ -22,7 +22,6 @@ BAG: Final = "clouds.mcap"
 RIG: Final = "rig.yaml"
 # File in a recording's folder: digest of the modules that made the recording.
 DIGEST: Final = "made-by.sha256"
-_ENCODER_MODULES: Final = ("cases.py", "clouds.py", "recordings.py", "scene.py")
 
 # Sensor kinds: an Ouster profile, or a model of another vendor.
 LOW: Final = "RNG15_RFL8_NIR8"
@@ -127,46 +126,34 @@ class BenchRecording:
         return sum(KINDS[sensor.kind].slots_per_s for sensor in self.sensors)
 
 
+def _ouster(
+    number: int, profile: str, phase_ns: int, translation_m: tuple[float, float, float], yaw: float
+) -> BenchSensor:
+    """An OS-1-128 with an address of its own."""
+    name = "abcdefgh"[number]
+    port = 7502 + 2 * number
+    serial = 122201000998 + number
+    source_ip = f"192.168.7.{11 + number}"
+    return BenchSensor(name, profile, source_ip, port, phase_ns, translation_m, yaw, serial)
+
+
 def _dual(profile: str) -> tuple[BenchSensor, ...]:
     """Two OS-1-128."""
-    return (
-        BenchSensor(
-            name="a",
-            kind=profile,
-            source_ip="192.168.7.11",
-            port=7502,
-            phase_ns=0,
-            translation_m=(0.0, 0.6, 1.8),
-            yaw_deg=0.0,
-            serial=122201000998,
-        ),
-        BenchSensor(
-            name="b",
-            kind=profile,
-            source_ip="192.168.7.12",
-            port=7504,
-            phase_ns=37_100_000,
-            translation_m=(0.0, -0.6, 1.8),
-            yaw_deg=90.0,
-            serial=122201000999,
-        ),
-    )
+    left = _ouster(0, profile, 0, (0.0, 0.6, 1.8), 0.0)
+    return left, _ouster(1, profile, 37_100_000, (0.0, -0.6, 1.8), 90.0)
 
 
 def _eight(profile: str) -> tuple[BenchSensor, ...]:
     """Eight OS-1-128 around a vehicle."""
     return tuple(
-        BenchSensor(
-            name=name,
-            kind=profile,
-            source_ip=f"192.168.7.{11 + number}",
-            port=7502 + 2 * number,
-            phase_ns=number * 12_300_000,
-            translation_m=(1.4 - 0.4 * number, 0.6 * (-1) ** number, 1.8),
-            yaw_deg=45.0 * number,
-            serial=122201000998 + number,
+        _ouster(
+            number,
+            profile,
+            number * 12_300_000,
+            (1.4 - 0.4 * number, 0.6 * (-1) ** number, 1.8),
+            45.0 * number,
         )
-        for number, name in enumerate("abcdefgh")
+        for number in range(8)
     )
 
 
@@ -216,9 +203,10 @@ RECORDINGS: Final[Mapping[str, BenchRecording]] = {
 @lru_cache(maxsize=1)
 def digest() -> str:
     """SHA-256 of the modules that determine the bytes of recordings."""
-    folder = Path(__file__).parent
-    sources = [(folder / name).read_bytes() for name in _ENCODER_MODULES]
-    return hashlib.sha256(b"".join(sources)).hexdigest()
+    here = Path(__file__)
+    encoders = (here.parents[2] / "mlbatch" / "simulate").rglob("*.py")
+    sources = [here, here.with_name("recordings.py"), *sorted(encoders)]
+    return hashlib.sha256(b"".join(path.read_bytes() for path in sources)).hexdigest()
 
 
 def is_current(folder: Path, recording: BenchRecording) -> bool:

@@ -7,10 +7,14 @@ from __future__ import annotations
 
 import ipaddress
 import struct
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
+from typing import TYPE_CHECKING, TypedDict
+
+if TYPE_CHECKING:
+    from typing_extensions import Unpack
 
 ETHERNET = 1
 NULL = 0
@@ -148,40 +152,44 @@ def link_frame(
     return packet
 
 
-def pcap_bytes(
+class PcapForm(TypedDict, total=False):
+    """How a capture is written."""
+
+    ns: bool
+    big_endian: bool
+    linktype: int
+    snaplen: int
+
+
+def pcap_parts(
     records: Iterable[tuple[int, bytes]],
     *,
     ns: bool = True,
     big_endian: bool = False,
     linktype: int = ETHERNET,
     snaplen: int = 262144,
-) -> bytes:
-    """A pcap file of (host_ns, frame) records; frames longer than `snaplen` are cut."""
+) -> Iterator[bytes]:
+    """A pcap file of (host_ns, frame) records in parts; frames longer than `snaplen` are cut."""
     order = ">" if big_endian else "<"
     magic = 0xA1B23C4D if ns else 0xA1B2C3D4
-    parts = [struct.pack(order + "IHHiIII", magic, 2, 4, 0, 0, snaplen, linktype)]
+    yield struct.pack(order + "IHHiIII", magic, 2, 4, 0, 0, snaplen, linktype)
     header = struct.Struct(order + "IIII")
     for host_ns, frame in records:
         seconds, rest_ns = divmod(host_ns, 1_000_000_000)
         fraction = rest_ns if ns else rest_ns // 1000
-        parts.append(header.pack(seconds, fraction, min(len(frame), snaplen), len(frame)))
-        parts.append(frame[:snaplen])
-    return b"".join(parts)
+        yield header.pack(seconds, fraction, min(len(frame), snaplen), len(frame))
+        yield frame[:snaplen]
 
 
-def write_pcap(
-    path: Path,
-    records: Iterable[tuple[int, bytes]],
-    *,
-    ns: bool = True,
-    big_endian: bool = False,
-    linktype: int = ETHERNET,
-    snaplen: int = 262144,
-) -> Path:
-    """Write `pcap_bytes` to `path` and return it."""
-    path.write_bytes(
-        pcap_bytes(records, ns=ns, big_endian=big_endian, linktype=linktype, snaplen=snaplen)
-    )
+def pcap_bytes(records: Iterable[tuple[int, bytes]], **form: Unpack[PcapForm]) -> bytes:
+    """The whole file."""
+    return b"".join(pcap_parts(records, **form))
+
+
+def write_pcap(path: Path, records: Iterable[tuple[int, bytes]], **form: Unpack[PcapForm]) -> Path:
+    """Write the file and return its path."""
+    with path.open("wb") as file:
+        file.writelines(pcap_parts(records, **form))
     return path
 
 
