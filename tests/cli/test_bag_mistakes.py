@@ -1,4 +1,4 @@
-"""Mistakes with bags: one line, no traceback; the table is in `builders/bag_mistakes.py`."""
+"""Mistakes with bags: one line, no traceback."""
 
 from __future__ import annotations
 
@@ -10,7 +10,6 @@ from pathlib import Path
 import pytest
 
 from mlbatch.simulate.ouster.encode import metadata_json
-from tests.builders.bag_mistakes import BAG_MISTAKES
 from tests.builders.bags import Body, Recorded, transforms_message
 from tests.builders.points import XYZ, cloud_message
 from tests.builders.rosbag1 import write_rosbag1
@@ -25,8 +24,9 @@ from tests.builders.sessions_of_bags import (
     urdf,
     write_mcap,
 )
-from tests.cli.test_mistakes import check
+from tests.builders.transcripts import transcripts
 
+BAG_MISTAKES = transcripts("bags")
 STILL = (0.0, 0.0, 0.0, 1.0)
 
 
@@ -130,4 +130,4 @@ def shell(
 
 @pytest.mark.parametrize("name", BAG_MISTAKES)
 def test_mistake_with_a_bag(shell: Shell, place: Path, name: str) -> None:
-    check(shell, place, BAG_MISTAKES[name])
+    BAG_MISTAKES[name].check(shell, place)

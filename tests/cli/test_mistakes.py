@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import re
 import sys
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
-from tests.builders.mistakes import MISTAKES, REAL_MISTAKES
 from tests.builders.sessions import (
     EPOCH_NS,
     FIXTURE,
@@ -23,7 +21,11 @@ from tests.builders.sessions import (
     write_metadata,
     write_session,
 )
+from tests.builders.transcripts import transcripts
 
+MISTAKES = transcripts("files")
+REAL_MISTAKES = transcripts("recordings")
+URLS = transcripts("urls")
 UPTIME = Unit(begin_ns=1000 * NS_PER_S, host_ns=EPOCH_NS - 1000 * NS_PER_S)
 
 
@@ -104,11 +106,6 @@ def _write_other_modes(folder: Path) -> None:
     write_metadata(folder / "turned" / "111.json", replace(SMALL, altitude_deg=turned))
 
 
-def _files(folder: Path) -> list[Path]:
-    """All files under a final name."""
-    return sorted(path for path in folder.rglob("*") if ".partial" not in str(path))
-
-
 @pytest.fixture
 def shell(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], place: Path
@@ -117,60 +114,20 @@ def shell(
     return Shell(monkeypatch, capsys)
 
 
-def check(shell: Shell, place: Path, mistake: tuple[str, int, str]) -> None:
-    """Run a mistake; nothing but the error line may result."""
-    arguments, code, message = mistake
-    before = _files(place)
-    named = " -o " in f" {arguments}" or "--quiet" in arguments
-    outcome = shell(f"convert {arguments}" if named else f"convert {arguments} -o out")
-    assert outcome.out == ""
-    lines = [line for line in outcome.err.splitlines() if "warning" not in line]
-    assert len(lines) == 1
-    pattern = ".*".join(map(re.escape, message.split("{*}")))
-    assert re.fullmatch(f"mlbatch: error: {pattern}", lines[0]), lines[0]
-    assert outcome.code == code
-    assert _files(place) == before
-
-
 @pytest.mark.parametrize("name", MISTAKES)
 def test_mistake(shell: Shell, place: Path, name: str) -> None:
-    check(shell, place, MISTAKES[name])
+    MISTAKES[name].check(shell, place)
 
 
 @pytest.mark.skipif(not RECORDINGS.is_dir(), reason=NO_RECORDINGS)
 @pytest.mark.parametrize("name", REAL_MISTAKES)
 def test_mistake_with_a_real_recording(shell: Shell, place: Path, name: str) -> None:
-    check(shell, place, REAL_MISTAKES[name])
-
-
-NO_OBSTORE = (
-    "expected the package obstore for URLs, found none ({*}); pip install 'mlbatch{*}[remote]'"
-)
-HERE = (
-    "expected a recording on this machine, found a URL; copy it here, or give it to mlbatch "
-    "convert or batch, which read URLs"
-)
-# (command without the extra, exit code, message)
-URLS = {
-    "input": ("convert https://e.org/a.pcap -o x.mcap", 2, f"https://e.org: {NO_OBSTORE}"),
-    "output": ("convert fix/two_lidars.pcap -o s3://b/x.mcap", 2, f"s3://b: {NO_OBSTORE}"),
-    "metadata": (
-        "convert bare/one.pcap -m https://e.org/m.json -o x.mcap",
-        2,
-        f"https://e.org: {NO_OBSTORE}",
-    ),
-    "batch": ("batch https://e.org/a.pcap -o out", 2, f"https://e.org/a.pcap: {NO_OBSTORE}"),
-    "pattern": ("batch s3://b/*.pcap -o out", 2, f"s3://b: {NO_OBSTORE}"),
-    "folder": ("batch fix/two_lidars.pcap -o s3://b/out", 2, f"s3://b/out: {NO_OBSTORE}"),
-    "state": ("batch-status s3://b/out", 2, f"s3://b: {NO_OBSTORE}"),
-    "inspected": ("inspect s3://b/x.pcap", 1, f"s3://b/x.pcap: {HERE}"),
-    "compared": ("compare https://e.org/x.mcap", 1, f"https://e.org/x.mcap: {HERE}"),
-}
+    REAL_MISTAKES[name].check(shell, place)
 
 
 @pytest.mark.parametrize("name", URLS)
 def test_a_url_without_the_extra(
-    shell: Shell, name: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+    shell: Shell, place: Path, name: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     from mlbatch.batch.remote import _store
 
@@ -178,51 +135,7 @@ def test_a_url_without_the_extra(
     monkeypatch.setitem(sys.modules, "obstore", None)
     monkeypatch.setitem(sys.modules, "obstore.store", None)
     monkeypatch.setenv("MLBATCH_CACHE", str(tmp_path))
-    command, code, message = URLS[name]
-    outcome = shell(command)
-    pattern = ".*".join(map(re.escape, message.split("{*}")))
-    assert re.fullmatch(f"mlbatch: error: {pattern}\n", outcome.err), outcome.err
-    assert (outcome.code, outcome.out) == (code, "")
-
-
-# What is given instead of another thing: (command, message).
-INSTEAD = {
-    "folder above a bag": (
-        "convert above -o out",
-        "above: expected a recording, found a folder with folders of bags (bag1, bag2); name "
-        "above/bag1",
-    ),
-    "description of a bag": (
-        "inspect above/bag1/metadata.yaml",
-        "above/bag1/metadata.yaml: expected a recording, found the description of a bag; name its "
-        "folder above/bag1",
-    ),
-    "page of a recording": (
-        "report fix/two_lidars.pcap",
-        "fix/two_lidars.pcap: expected an output with its report, found pcap without one; convert "
-        "a recording first (mlbatch convert fix/two_lidars.pcap -o scans.mcap), or give the report "
-        "with --report",
-    ),
-    "page of a bag": (
-        "report above/bag1",
-        "above/bag1: expected a report in or next to the output, found none; give it with "
-        "--report, or convert the recording",
-    ),
-    "own documents as metadata": (
-        "convert documents/capture.pcap -o out",
-        "documents/capture.pcap: {*}found none in the recording's directory; give {*}",
-    ),
-}
-
-
-@pytest.mark.parametrize("name", INSTEAD)
-def test_the_right_thing_is_named(shell: Shell, place: Path, name: str) -> None:
-    command, message = INSTEAD[name]
-    outcome = shell(command)
-    pattern = ".*".join(map(re.escape, message.split("{*}")))
-    assert re.fullmatch(f"mlbatch: error: {pattern}\n", outcome.err), outcome.err
-    assert (outcome.code, outcome.out) == (1, "")
-    assert place.is_dir()
+    URLS[name].check(shell, place)
 
 
 def test_ambiguous_metadata_name_their_files(shell: Shell, place: Path) -> None:

@@ -1,4 +1,4 @@
-"""Mistakes with lidars of all vendors; the table is in `builders/vendor_mistakes.py`."""
+"""Mistakes with lidars of all vendors."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from tests.builders.others import EE, filled
 from tests.builders.points import CLOUD, OUSTER, cloud_message
 from tests.builders.rosbag2 import write_rosbag2
 from tests.builders.sessions import NS_PER_S, Report, Shell, report_of, write_metadata
-from tests.builders.vendor_mistakes import RIGS, VENDOR_MISTAKES
+from tests.builders.transcripts import transcripts
 from tests.builders.vendor_sessions import (
     BEGIN_NS,
     BEGIN_US,
@@ -37,7 +37,6 @@ from tests.builders.vendor_sessions import (
     write_capture,
     write_rig,
 )
-from tests.cli.test_mistakes import check
 
 VLP16 = VelodyneSpec("VLP-16", start_us=BEGIN_US)
 XT16 = HesaiSpec("PandarXT-16")
@@ -53,6 +52,43 @@ RS_PORT = 6699
 DIFOP_PORT = 7788
 IP = "10.0.0.8"
 OTHER_IP = "10.0.0.9"
+VENDOR_MISTAKES = transcripts("vendors")
+
+_PLACED = "extrinsics: {matrix: [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]]}"
+_LEFT = f"name: left, metadata: silent/111.json, stream: {{source_ip: 10.0.0.1}}, {_PLACED}"
+_TOP = f"name: top, stream: {{source_ip: 10.0.0.8}}, {_PLACED}"
+
+# Sensors of the rigs, by the name of the file.
+RIGS: dict[str, tuple[str, ...]] = {
+    "any": ("name: top",),
+    "cloud_csv": ("name: top, stream: {topic: /points}, metadata: files/xt16.csv",),
+    "firing": ("name: top, decode: {firing_azimuth: maybe}",),
+    "helios32": ("name: top, model: Helios 32",),
+    "lite": ("name: top, model: Puck LITE",),
+    "livox": ("name: top, model: Livox SDK2",),
+    "os1": ("name: top, model: OS1-32",),
+    "rs16_csv": ("name: top, metadata: files/rs16.csv",),
+    "serial": ('name: top, stream: {serial: "77"}',),
+    "silent": (_LEFT, _TOP),
+    "silent_csv": (_LEFT, f"{_TOP}, metadata: files/xt16.csv"),
+    "silent_helios": (_LEFT, f"{_TOP}, model: Helios 16"),
+    "silent_livox": (_LEFT, f"{_TOP}, model: Livox SDK2"),
+    "silent_vlp16": (_LEFT, f"{_TOP}, model: VLP-16"),
+    "two": (f"name: front, {_PLACED}", f"name: rear, {_PLACED}"),
+    "same": (
+        f"name: front, model: VLP-16, {_PLACED}",
+        f"name: rear, stream: {{port: 2368}}, {_PLACED}",
+    ),
+    "vlp16": ("name: top, model: VLP-16",),
+    "vlp32c": ("name: top, model: VLP-32C",),
+    "hdl32e_yml": ("name: top, model: VLP-32C, metadata: files/hdl32e.yml",),
+    "vlp32c_yml": ("name: top, metadata: files/vlp32c.yml",),
+    "vlp61": ("name: top, model: VLP-61",),
+    "small": ("name: top, model: vls-128",),
+    "xt16": ("name: top, model: PandarXT-16",),
+    "xt16_csv": ("name: top, metadata: files/xt16.csv",),
+    "folder": ("name: top, metadata: files",),
+}
 
 
 @pytest.fixture(scope="module")
@@ -179,7 +215,7 @@ def shell(
 
 @pytest.mark.parametrize("name", VENDOR_MISTAKES)
 def test_mistake_with_a_maker(shell: Shell, place: Path, name: str) -> None:
-    check(shell, place, VENDOR_MISTAKES[name])
+    VENDOR_MISTAKES[name].check(shell, place)
 
 
 def _converted(shell: Shell, arguments: str, folder: Path) -> Report:

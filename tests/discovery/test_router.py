@@ -10,7 +10,6 @@ from typing import Any
 
 import pytest
 
-from tests.builders import advice
 from tests.builders.captures import udp_frame
 from tests.builders.sessions import (
     EPOCH_NS,
@@ -30,6 +29,11 @@ from tests.builders.sessions import (
 Report = dict[str, Any]
 Convert = Callable[[str], Report]
 OUSTER = RECORDINGS / "ouster"
+_METADATA_ADVICE = (
+    ". Ouster calls it metadata (JSON): get it with `curl "
+    "http://SENSOR_IP/api/v1/sensor/metadata > left.json`, or take the .json that Ouster Studio, "
+    "ouster-cli or the driver saved next to its recording"
+)
 needs_recordings = pytest.mark.skipif(not RECORDINGS.is_dir(), reason=NO_RECORDINGS)
 PACKETS = 96  # 3 revolutions
 IDENTITY = "--identity-extrinsics"
@@ -393,7 +397,7 @@ def test_a_lidar_left_out_whole_is_an_error(shell: Shell, tmp_path: Path, option
     assert outcome.err == (
         f"mlbatch: error: {capture}: 10.0.0.2 > port 7502: {NEEDS_METADATA.format(333)}; expected "
         "metadata that match, found only 111.json; give --metadata FILE, or leave it out with "
-        f"--ignore 10.0.0.2:7502{advice.OUSTER}\n"
+        f"--ignore 10.0.0.2:7502{_METADATA_ADVICE}\n"
     )
     assert not (tmp_path / "out").exists()
     # Without a conversion it is a row of the table.
