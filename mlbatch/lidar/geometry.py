@@ -23,8 +23,6 @@ from mlbatch.arrays import F32Array, F64Array, I64Array
 _ANGLE_BITS = 32
 _SPEED_BITS = 24
 _REVOLUTION = float(1 << _ANGLE_BITS)
-SPEED_PER_HZ = float(1 << 48) * 1e-9
-_SPEED_LIMIT = (1 << (_SPEED_BITS - 1)) - 1
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,7 +32,7 @@ class BeamTable:
     direction: (3, B, 3), vectors U1, U2, U3 of every beam; origin: (3, B, 3), or (3, 1, 3) if
     shared by all beams, vectors O1, O2, O3; reach_m: (B,) or (1,), added to the range before
     projection; angle_rad: (W,), angle of every rotor position, or None if columns have rotor words
-    (`rotor_words`).
+    (`read_rotor_words`).
     """
 
     direction: F64Array
@@ -89,27 +87,6 @@ def spherical(
     else:
         rows = ((right, forward, zero), (forward, -right, zero), (zero, zero, up))
     return np.stack([np.stack(row, axis=-1) for row in rows])
-
-
-def rotor_words(
-    revolutions: F64Array, revolutions_per_s: F64Array, table: I64Array | int = 0
-) -> I64Array:
-    """Return the `encoder` of columns of sensors without an angle table; arguments broadcast.
-
-    revolutions: rotor angle at the timestamp of the column (whole revolutions are removed);
-    revolutions_per_s: rotor speed while the beams of the column fire, Hz, 0 to ignore it; table:
-    row of the column in `Lidar.firing_ns`.
-    """
-    ticks = revolutions - np.floor(revolutions)
-    ticks *= _REVOLUTION
-    angle = np.rint(ticks, out=ticks).astype(np.int64)
-    angle &= (1 << _ANGLE_BITS) - 1
-    steps = np.rint(revolutions_per_s * SPEED_PER_HZ)
-    speed = np.minimum(np.maximum(steps, -_SPEED_LIMIT), _SPEED_LIMIT).astype(np.int64)
-    speed &= (1 << _SPEED_BITS) - 1
-    speed <<= _ANGLE_BITS
-    words: I64Array = angle | (speed | np.asarray(table) << (_ANGLE_BITS + _SPEED_BITS))
-    return words
 
 
 def read_rotor_words(words: I64Array) -> tuple[F64Array, F64Array, I64Array]:

@@ -16,8 +16,8 @@ from hypothesis import strategies as st
 
 from mlbatch.arrays import BoolArray, I64Array
 from mlbatch.batching.loss import GapLoss, SequenceLoss
-from mlbatch.lidar.geometry import rotor_words
 from mlbatch.types import ColumnHeaders
+from tests.builders.rotor import rotor_words
 
 # -- by sequence numbers --------------------------------------------------------------------------
 

@@ -20,8 +20,8 @@ from mlbatch.batching.sweeps import (
     SweepSet,
     publication_order,
 )
-from mlbatch.lidar.geometry import rotor_words
 from mlbatch.units import NS_PER_MS
+from tests.builders.rotor import rotor_words
 
 Spans = list[tuple[int, int, int]]  # (first, last, ready) of sweeps, ms
 

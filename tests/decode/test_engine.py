@@ -26,7 +26,7 @@ from mlbatch.decode.packet_ring import PacketRing
 from mlbatch.decode.scan_buffer import LABEL, ScanBuffer
 from mlbatch.decode.source import Source
 from mlbatch.frames.transforms import from_rpy_deg
-from mlbatch.lidar.geometry import BeamTable, rotor_words
+from mlbatch.lidar.geometry import BeamTable
 from mlbatch.lidar.interface import Lidar
 from mlbatch.native.arena import PacketArena
 from mlbatch.native.library import library
@@ -45,6 +45,7 @@ from mlbatch.writers.point_layouts import (
     ROWS_TIME,
 )
 from tests.builders.engines import BOXES_M, MOST_COLUMNS, Pair, assert_same
+from tests.builders.rotor import rotor_words
 from tests.contract.tree import PACKAGE
 from tests.golden import test_every_model as models
 from tests.reference.decoder import readings_of, record_of

@@ -20,7 +20,6 @@ from mlbatch.batching.merge import ColumnMerge
 from mlbatch.decode.decoder import ScanHeader
 from mlbatch.decode.packet_ring import PacketRing
 from mlbatch.decode.source import Source
-from mlbatch.lidar.geometry import rotor_words
 from mlbatch.lidar.headers import content_keys, hash_factors
 from mlbatch.lidar.interface import Lidar
 from mlbatch.native.arena import PacketArena
@@ -44,6 +43,7 @@ from mlbatch.types import (
 from tests.builders.captures import udp_frame
 from tests.builders.engines import BOXES_M, Pair
 from tests.builders.headers import check_headers, ouster_packets
+from tests.builders.rotor import rotor_words
 from tests.builders.velodyne_streams import PLAIN, made_of
 from tests.decode.test_engine import (
     END_NS,

@@ -14,10 +14,10 @@ from mlbatch.frames.transforms import from_rpy_deg
 from mlbatch.lidar.geometry import (
     BeamTable,
     read_rotor_words,
-    rotor_words,
     spherical,
 )
 from tests.builders.decoded import Rotor, projected
+from tests.builders.rotor import rotor_words
 
 AZIMUTH_DEG = (0.0, 1.5, -4.2, 30.0)
 ELEVATION_DEG = (-25.0, -1.0, 3.0, 15.0)

@@ -7,10 +7,11 @@ import math
 import numpy as np
 import pytest
 
-from mlbatch.lidar.geometry import read_rotor_words, rotor_words
+from mlbatch.lidar.geometry import read_rotor_words
 from mlbatch.sensors.hesai.angles import read_angles, read_at128
 from mlbatch.sensors.velodyne.calibration import VelodyneFile
 from tests.builders.decoded import projected
+from tests.builders.rotor import rotor_words
 from tests.recordings import RECORDINGS
 from tests.sensors.hesai.test_at128 import CHANNELS, DEG, NO_FIRING, beams, by_the_sheet
 from tests.sensors.velodyne.test_calibration import read

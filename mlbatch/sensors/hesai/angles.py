@@ -80,14 +80,13 @@ class HesaiAngles:
 class At128File:
     """Angles of an AT128, whose rotor carries mirrors.
 
-    start_rad, end_rad: (3,) range of rotor angles of each mirror.
+    start_rad: (3,) rotor angles at which the mirrors begin.
     azimuth_rad, elevation_rad: (128,).
     adjust: (128, 180), added at rotor angles 0, 2, 4 .. 358 deg.
     """
 
     path: Path
     start_rad: F64Array
-    end_rad: F64Array
     azimuth_rad: F64Array
     elevation_rad: F64Array
     azimuth_adjust_rad: F64Array
@@ -152,7 +151,6 @@ def read_at128(path: Path, content: bytes) -> At128File | None:
     return At128File(
         path,
         values["start"] * angle,
-        values["end"] * angle,
         values["azimuth"] * angle,
         values["elevation"] * angle,
         values["azimuth_adjust"] * adjust,

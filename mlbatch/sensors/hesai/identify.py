@@ -15,7 +15,8 @@ import numpy as np
 from mlbatch.arrays import BoolArray, U8Array
 from mlbatch.sensors.hesai import PREFIX_SIZE
 from mlbatch.sensors.hesai import models as rows
-from mlbatch.sensors.hesai.layout import (
+from mlbatch.sensors.hesai.models import Model
+from mlbatch.sensors.hesai.packets import (
     AMBIENT,
     ONLY_RETURN,
     RETURN_MODES,
@@ -26,7 +27,6 @@ from mlbatch.sensors.hesai.layout import (
     tail_at,
     unit_mm,
 )
-from mlbatch.sensors.hesai.models import Model
 from mlbatch.sensors.packet_bytes import (
     NO_DECODER,
     has_bytes,

@@ -22,9 +22,9 @@ from mlbatch.sensors.base import BaseLidar
 from mlbatch.sensors.hesai import models as rows
 from mlbatch.sensors.hesai.angles import At128File, HesaiAngles, read_angles, read_at128
 from mlbatch.sensors.hesai.identify import describe, identify
-from mlbatch.sensors.hesai.layout import Layout
 from mlbatch.sensors.hesai.models import Model
 from mlbatch.sensors.hesai.packets import (
+    Layout,
     firing_tables,
     first_azimuths,
     header_table,

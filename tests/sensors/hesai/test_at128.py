@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from mlbatch.arrays import F64Array, I64Array
-from mlbatch.lidar.geometry import rotor_words
 from mlbatch.sensors.hesai.angles import At128File
 from mlbatch.sensors.hesai.projections import at128_projection
 from tests.builders.decoded import Rotor, projected
+from tests.builders.rotor import rotor_words
 
 DEG = math.pi / 180
 CHANNELS = 128
@@ -29,7 +29,6 @@ def plain_file() -> At128File:
     return At128File(
         Path("at.dat"),
         np.array([30.0, 150.0, 270.0]) * DEG,
-        np.array([150.0, 270.0, 30.0]) * DEG,
         np.zeros(CHANNELS),
         np.arange(CHANNELS) / 10 * DEG,
         azimuth_adjust * DEG,
@@ -148,10 +147,7 @@ def test_pose_turns_and_moves_the_points() -> None:
 def by_the_sheet(file: At128File, rotor_rad: float, channel: int) -> tuple[float, float, float]:
     """The unit vector of a beam; the rule of the source, in degrees."""
     rotor = math.degrees(rotor_rad) % 360
-    starts, ends = np.degrees(file.start_rad), np.degrees(file.end_rad)
-    for start, end in zip(starts, ends, strict=True):
-        if (rotor - start) % 360 < (end - start) % 360:
-            past = (rotor - start) % 360
+    past = min((rotor - start) % 360 for start in np.degrees(file.start_rad).tolist())
     low = int(rotor // 2)
     part = rotor / 2 - low
 

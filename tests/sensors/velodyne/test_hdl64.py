@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 
 from mlbatch.arrays import F32Array, F64Array, I64Array
-from mlbatch.lidar.geometry import rotor_words
 from mlbatch.sensors.velodyne.calibration import VelodyneFile, read_velodyne
 from mlbatch.sensors.velodyne.packets import hdl64_projection
 from mlbatch.simulate.velodyne.models import calibration_yaml
 from tests.builders.decoded import Rotor, projected
+from tests.builders.rotor import rotor_words
 
 LASERS = 64
 AT_ONCE = np.zeros((1, LASERS), np.int64)
