@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import shlex
+import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from fractions import Fraction
@@ -13,6 +15,7 @@ from mlbatch.cli.run import Target
 from mlbatch.errors import UsageError
 from mlbatch.options import INSTANTS
 from mlbatch.pipeline.job import Job, check_max_bag_s
+from mlbatch.pipeline.output import OutputRequest
 from mlbatch.python.options import RatedOptions, SessionOptions, choice, session_job, window_job
 from mlbatch.sensors import DECODE_OPTIONS
 from mlbatch.units import parse_rate
@@ -61,19 +64,27 @@ def target_of(values: Mapping[str, Any]) -> Target:
     on_jump = choice("--on-jump", values["on_jump"], ("error", "split"))
     output(values["output"], dry_run=values["dry_run"])
     report = values["report"]
+    resume(values["resume"], dry_run=values["dry_run"])
     names = (
-        *("output", "format", "point_layout", "compression", "ply_style", "dry_run", "html"),
-        *("overwrite", "quiet", "verbose"),
+        *("output", "format", "point_layout", "compression", "ply_style", "dry_run"),
+        *("overwrite", "resume"),
     )
-    return Target(
+    request = OutputRequest(
         **{name: values[name] for name in names},
         jobs=parse_jobs("--jobs", values["jobs"]),
         report=None if is_stdout(report) else report,
+        fsync=not values["no_fsync"],
+        # As typed into a shell.
+        command=shlex.join(["mlbatch", *sys.argv[1:]]),
+    )
+    return Target(
+        request,
         prints_report=is_stdout(report),
+        html=values["html"],
         split_jumps=on_jump == "split",
         limits=_fail_on(values["fail_on"] or ()),
-        resume=resume(values["resume"], dry_run=values["dry_run"]),
-        fsync=not values["no_fsync"],
+        quiet=values["quiet"],
+        verbose=values["verbose"],
     )
 
 
@@ -168,10 +179,9 @@ def output(path: Path | None, *, dry_run: bool) -> None:
         raise UsageError("-o: expected an output, found none; give -o scans.mcap, or --dry-run")
 
 
-def resume(resume: bool, *, dry_run: bool) -> bool:
+def resume(is_given: bool, *, dry_run: bool) -> None:
     """`--resume`, which a dry run cannot have: it leaves no output."""
-    if resume and dry_run:
+    if is_given and dry_run:
         raise UsageError(
             "--resume: expected an output to continue, found --dry-run; give one of them"
         )
-    return resume

@@ -18,9 +18,9 @@ from typing import Any
 import pytest
 
 import mlbatch
-from mlbatch.cli import run
 from mlbatch.errors import ExportError, RecordingError
 from mlbatch.pipeline import files, job_identity, workers
+from mlbatch.pipeline import output as pipeline_output
 from mlbatch.readers import source
 from mlbatch.types import Scan
 from mlbatch.writers import atomic
@@ -660,7 +660,7 @@ def test_a_run_that_began_after_the_check_is_not_disturbed(
             fcntl.flock(file, fcntl.LOCK_EX)
             file.write(b"what it did")
 
-        monkeypatch.setattr(run, "check_target", other_run)
+        monkeypatch.setattr(pipeline_output, "check_target", other_run)
         outcome = shell(f"convert {CAPTURE} -o {output}")
     assert (outcome.code, "expected no other run that writes it, found one" in outcome.err) == (
         1,
@@ -675,7 +675,7 @@ def test_an_output_that_cannot_be_opened_leaves_nothing(
     def refuse(*_: object) -> None:
         Path("out").mkdir()
 
-    monkeypatch.setattr(run, "check_target", refuse)
+    monkeypatch.setattr(pipeline_output, "check_target", refuse)
     outcome = shell(f"convert {CAPTURE} -o out")
     assert (outcome.code, "found an existing one" in outcome.err) == (1, True)
     assert [path.name for path in Path().iterdir()] == ["out"]

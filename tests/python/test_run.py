@@ -11,6 +11,7 @@ import pytest
 
 import mlbatch
 from mlbatch.errors import ExportError, NoScanError, UsageError
+from mlbatch.pipeline import preflight
 from tests.contract.tree import ROOT
 
 FIXTURE = ROOT / "fixtures" / "two_lidars"
@@ -49,7 +50,7 @@ def test_the_report_of_a_run(tmp_path: Path) -> None:
     assert run.report.warnings == ()
     assert run.report_path == tmp_path / "scans" / "report.json"
     stored = json.loads(run.report_path.read_text(encoding="utf-8"))
-    assert stored["sensors"] == json.loads(json.dumps(run.report.as_json()["sensors"]))
+    assert stored == json.loads(json.dumps(run.report.as_json()))
     assert str(run.report).splitlines()[1].split()[0] == "left"
 
 
@@ -78,6 +79,16 @@ def test_an_existing_output_is_kept(tmp_path: Path) -> None:
     assert output.read_bytes() == before
     mlbatch.convert(CAPTURE, output, rig=RIG, rate=20, overwrite=True)
     assert output.read_bytes() != before
+
+
+def test_a_warning_names_the_line_of_the_caller(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(preflight, "free_bytes", lambda path: CAPTURE.stat().st_size - 1)
+    with pytest.warns(UserWarning, match="disk: .* may not be enough") as warned:
+        mlbatch.convert(CAPTURE, tmp_path / "scans.mcap", rig=RIG)
+    own = [one for one in warned if one.category is UserWarning]
+    assert [one.filename for one in own] == [__file__]
 
 
 def test_a_run_without_a_scan_leaves_nothing(tmp_path: Path) -> None:

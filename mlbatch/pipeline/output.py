@@ -1,0 +1,250 @@
+"""The output of a job as the command line and Python ask for it: checked, made, reported."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
+
+from mlbatch.errors import ExportError, UsageError
+from mlbatch.pipeline import preflight
+from mlbatch.pipeline.conversion import Conversion, Progress
+from mlbatch.pipeline.job import Job
+from mlbatch.pipeline.run import convert
+from mlbatch.report.report import RunReport, report_text
+from mlbatch.types import RunInfo
+from mlbatch.writers import (
+    FILES_JSONL,
+    SHARD_JSON,
+    FilesWriter,
+    ScanWriter,
+    WriterOptions,
+    check_options,
+    check_target,
+    check_variants,
+    choose_format,
+    export_errors,
+    extras,
+    jobs_for,
+    open_writer,
+    partial_path,
+    record_layout,
+    report_paths,
+    state_path,
+    sync_entries,
+    tidy,
+    write_text,
+)
+
+# Loaded where it is needed: a dry run has no files.
+if TYPE_CHECKING:
+    from mlbatch.pipeline.files import Files
+
+Listener = Callable[[str], None]
+
+
+class OutputRequest(NamedTuple):
+    """Where a result goes and how it is stored; names and defaults as in `mlbatch convert`."""
+
+    output: Path | None
+    format: str | None = None  # None: by the output
+    point_layout: str = "standard"
+    compression: str = "none"
+    ply_style: str = "standard"
+    dry_run: bool = False
+    jobs: int | None = None  # None: auto
+    report: Path | None = None  # None: next to the output
+    overwrite: bool = False
+    resume: bool = False
+    fsync: bool = True
+    command: str = ""  # for the report
+
+    @property
+    def written(self) -> Path | None:
+        """The output, None in a dry run."""
+        return None if self.dry_run else self.output
+
+
+class Output:
+    """An output that can be made: all was checked that does not need the recording.
+
+    format: its name; report_path: None without a report; files: None in a dry run; is_complete: an
+    earlier run of the job has made all of it. `say` takes a line for the user, `warn` a warning.
+    """
+
+    def __init__(self, job: Job, request: OutputRequest, say: Listener, warn: Listener) -> None:
+        self.format = choose_format(request.output, request.format)
+        self.files: Files | None = None
+        self.report_path = request.report
+        self.is_complete = False
+        self._request = request
+        self._say = say
+        options = WriterOptions(
+            request.point_layout,
+            request.overwrite,
+            job.split,
+            compression=request.compression,
+            ply_style=request.ply_style,
+            fsync=request.fsync,
+            max_bag_s=job.max_bag_s,
+        )
+        check_options(self.format, options)
+        check_variants(self.format, job.variants)
+        if job.shard is not None:
+            from mlbatch.pipeline.shards import check_format
+
+            check_format(self.format, options)
+        path = request.written
+        jobs = request.jobs or 1 if path is None else jobs_for(request.jobs, self.format, options)
+        self.job = replace(job, extras=extras(self.format, options), jobs=jobs)
+        self._options = options
+        if path is not None:
+            self.job = replace(self.job, record=record_layout(self.format, options))
+            preflight.check_output(self.job, path, self.format)
+            if request.resume and self._was_completed(path):
+                self.is_complete = True
+                return
+            self._prepare(path, warn)
+        preflight.check_report(self.job, self.report_path, path, self.format)
+
+    def _prepare(self, path: Path, warn: Listener) -> None:
+        """Take the files of an interrupted run, or check that all can be made from the start."""
+        from mlbatch.pipeline.files import Files, find
+
+        _remove_state(path, self._say)
+        resumes = self._request.resume
+        earlier = find(path)
+        if earlier is not None and not resumes:
+            warn(
+                f"interrupted: {partial_path(path)} with {earlier.scans} finished scans is "
+                "discarded; --resume would continue after them"
+            )
+        files = Files(path, self.job, self.format, self._options, earlier if resumes else None)
+        self.files = files
+        self._options = self._options._replace(files=files)
+        if not files.is_continued:
+            if resumes:
+                self._say(f"{path}: nothing to resume; started over")
+            check_target(self.format, path, self._options, self.job.layout)
+            if shortage := preflight.check_disk(self.job, path):
+                warn(shortage)
+        if self.job.shard is None and self.report_path is None:
+            self.report_path = report_paths(path, self.format).report
+
+    def make(self, progress: Progress | None = None) -> tuple[Conversion, RunReport]:
+        """Convert, write the output and its report; returns the run and what the report has."""
+        path = self._request.written
+        if path is None:
+            run, report = convert(self.job, None, progress)
+            report = self._completed(report)
+            if self.report_path is not None:
+                write_text(self.report_path, report_text(report))
+            return run, report
+        run, report = convert(
+            self.job, lambda info: self._open(path, info), progress, self.files, self._finish
+        )
+        return run, self._completed(report)
+
+    def _completed(self, report: RunReport) -> RunReport:
+        """The report with the command line and, of an output, what made it."""
+        report = report._replace(command=self._request.command)
+        if self.files is None or self.files.is_shard:
+            return report
+        from mlbatch.pipeline.job_identity import identity_of_parts
+
+        return report._replace(identity=identity_of_parts(self.files.identity))
+
+    def _open(self, path: Path, info: RunInfo) -> ScanWriter:
+        files = self.files
+        if files is not None and files.is_continued:
+            # Only now it is known that this is the job of the interrupted run.
+            self._say(f"{path}: resumed after {files.scans} scans")
+        writer = open_writer(self.format, path, info, self._options)
+        if files is not None and files.is_shard and not isinstance(writer, FilesWriter):
+            from mlbatch.pipeline.shards import not_in_files
+
+            writer.abandon()
+            raise not_in_files(self.format)
+        return writer
+
+    def _finish(self, report: RunReport, partial: Path) -> None:
+        """Write the report, or the account of a shard.
+
+        Before the output has its name, so that no output is without one.
+        """
+        files, output, path = self.files, self._request.written, self.report_path
+        report = self._completed(report)
+        if files is not None and files.is_shard:
+            from mlbatch.pipeline.shards import write_account
+
+            write_account(partial, self.format, self._options, files, report)
+            return
+        if path is None or output is None:
+            return
+        if path.parent.absolute() == output.absolute():
+            path = partial / path.name
+        write_text(path, report_text(report), self._options.fsync)
+        if self._options.fsync and path.parent.absolute() != output.parent.absolute():
+            sync_entries(path.parent)
+
+    # -- earlier runs -------------------------------------------------------------------------
+
+    def _was_completed(self, path: Path) -> bool:
+        """True if an earlier run of this job completed the output: there is nothing to resume.
+
+        UsageError if another job made the output, ExportError if files of it are missing.
+        """
+        from mlbatch.pipeline.files import missing
+
+        if self._request.overwrite or not path.exists() or partial_path(path).exists():
+            return False
+        changed = self._difference(path)
+        if changed:
+            raise UsageError(
+                f"{path}: expected the complete output of this job for --resume, found {changed}; "
+                "choose another output, or replace this one with --overwrite"
+            )
+        lost = missing(path, self.job, self.format, self._options)
+        if lost:
+            raise ExportError(
+                f"{path}: expected all files of the complete output for --resume, found "
+                f"{len(lost)} missing, first {lost[0]}; restore it, or make all again with "
+                "--overwrite"
+            )
+        tidy(path)
+        self._say(f"{path}: is complete; there is nothing to resume")
+        return True
+
+    def _difference(self, path: Path) -> str:
+        """First difference between the job and the one that made an output, "" if there is none.
+
+        Outputs that do not say which job made them have none.
+        """
+        from mlbatch.pipeline.job_identity import difference_of_outputs, identity_of, read_identity
+
+        job = self.job
+        is_shard = (path / SHARD_JSON).is_file()
+        if is_shard != (job.shard is not None):
+            return (
+                f"a shard ({SHARD_JSON})" if is_shard else "all of its scans, not those of a shard"
+            )
+        report = self._request.report or report_paths(path, self.format).report
+        identity = read_identity(report if job.shard is None else path / SHARD_JSON)
+        if not identity:
+            return ""
+        shard = {} if job.shard is None else {"shard": str(job.shard)}
+        return difference_of_outputs(identity, identity_of(job, self.format, self._options) | shard)
+
+
+def _remove_state(path: Path, say: Listener) -> None:
+    """Remove the state file of an earlier version next to an output."""
+    old = state_path(path)
+    if not old.is_file():
+        return
+    say(
+        f"{old}: expected {FILES_JSONL} in {partial_path(path)}, found the state file of an "
+        "earlier version of mlbatch; it is removed, and all files are made again"
+    )
+    with export_errors(old):
+        old.unlink()
