@@ -2,7 +2,7 @@
 
     python casestudy.py --seeds 3            # `make casestudy`
 
-docs/casestudy.md describes method, figures and results. Cells that are finished are kept.
+docs/does-it-help.md describes method, figures and results. Cells that are finished are kept.
 """
 
 from __future__ import annotations

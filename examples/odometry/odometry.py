@@ -3,7 +3,7 @@
     python odometry.py --seeds 8                      # simulated rigs: `make odometry`
     python odometry.py drive.pcap --rig rig.yaml --truth truth.tum -o compared
 
-docs/odometry.md describes inputs, results and figures.
+docs/does-it-help.md describes inputs, results and figures.
 """
 
 from __future__ import annotations
