@@ -10,12 +10,12 @@ if TYPE_CHECKING:
     from mlbatch.api import open as open
     from mlbatch.api import read as read
     from mlbatch.api import scans as scans
-    from mlbatch.digest import digest as digest
+    from mlbatch.digests import digest as digest
     from mlbatch.errors import MlbatchError as MlbatchError
     from mlbatch.outputs.scan import Scan as Scan
     from mlbatch.python.recording import Recording as Recording
     from mlbatch.python.run import Run as Run
-    from mlbatch.verify import verify as verify
+    from mlbatch.verification import verify as verify
 
 __version__ = "0.1.0"
 __all__ = [
@@ -39,7 +39,7 @@ _PLACES = {
     "Scan": "mlbatch.outputs.scan",
     **dict.fromkeys(("convert", "inspect", "open", "read", "scans"), "mlbatch.api"),
 }
-_CALLABLE_PACKAGES = ("digest", "verify")
+_CALLABLE_PACKAGES = {"digest": "digests", "verify": "verification"}
 
 
 def __getattr__(name: str) -> object:
@@ -48,7 +48,7 @@ def __getattr__(name: str) -> object:
 
     if name in _CALLABLE_PACKAGES:
         # Importing them replaces any function of their name here.
-        return importlib.import_module(f"mlbatch.{name}")
+        return importlib.import_module(f"mlbatch.{_CALLABLE_PACKAGES[name]}")
     if name not in _PLACES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     return getattr(importlib.import_module(_PLACES[name]), name)

@@ -21,7 +21,7 @@ if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
 # Whole suites of cases: folders, files and tests that take seconds. `make test-quick` leaves them
-# out; who works on their subject names them: `pytest tests/verify`.
+# out; who works on their subject names them: `pytest tests/verification`.
 LONG = (
     "batch/",
     "bench/",

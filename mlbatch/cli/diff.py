@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 if TYPE_CHECKING:
-    from mlbatch.digest.diff import FieldDifference, OutputDiff
+    from mlbatch.digests.diff import FieldDifference, OutputDiff
 
 # Differences of the run, and scans of one output only, that are printed; the others are counted.
 SHOWN = 20
@@ -26,8 +26,8 @@ def diff(
 ) -> None:
     """Compare two outputs: first differing scan, field and point, and by how much; exit 1."""
     from mlbatch.batch.remote import local_output
-    from mlbatch.digest.diff import check_tolerance
-    from mlbatch.digest.diff import diff as compare
+    from mlbatch.digests.diff import check_tolerance
+    from mlbatch.digests.diff import diff as compare
     from mlbatch.errors import RecordingError, one_line
 
     check_tolerance(tolerance)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 if TYPE_CHECKING:
-    from mlbatch.digest import Comparison
+    from mlbatch.digests import Comparison
 
 # Differences that are printed; the others are counted.
 SHOWN = 20
@@ -35,8 +35,8 @@ def digest(
 ) -> None:
     """Describe an output in a golden file for tests, or compare it with one."""
     from mlbatch.batch.remote import local_output
-    from mlbatch.digest import compare, golden_text, read_golden
-    from mlbatch.digest import digest as describe
+    from mlbatch.digests import compare, golden_text, read_golden
+    from mlbatch.digests import digest as describe
     from mlbatch.errors import UsageError, one_line
 
     if against is None:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 if TYPE_CHECKING:
-    from mlbatch.verify import Verdict
+    from mlbatch.verification import Verdict
 
 # Violations in text output; the others are counted. JSON has up to 1000.
 SHOWN = 20
@@ -33,8 +33,8 @@ def verify(
 ) -> None:
     """Check grid, order, times, counts and ledgers of an output, from the output alone."""
     from mlbatch.cli.progress import progress_bar
-    from mlbatch.verify import VerifyError
-    from mlbatch.verify import verify as check
+    from mlbatch.verification import VerifyError
+    from mlbatch.verification import verify as check
 
     with progress_bar("verify", unit="scans", is_verbose=verbose) as progress:
         verdict = check(output, report, progress)

@@ -9,7 +9,7 @@ from mlbatch.bounded import open_file, parse_json
 from mlbatch.errors import ExportError, RecordingError
 from mlbatch.outputs.folders import refuse_shard
 from mlbatch.page.values import Values
-from mlbatch.verify.report_checks import REPORT, SCHEMA, TABLE, ReportPlaces
+from mlbatch.verification.report_checks import REPORT, SCHEMA, TABLE, ReportPlaces
 
 _REPORT_SUFFIX = f".{REPORT}"
 

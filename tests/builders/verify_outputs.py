@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from mlbatch.verify import Verdict, verify
+from mlbatch.verification import Verdict, verify
 from tests.builders.run import TWO_LIDARS, command
 
 Values = npt.NDArray[Any]

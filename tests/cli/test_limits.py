@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from mlbatch.verify import verify
+from mlbatch.verification import verify
 from tests.builders.run import command
 from tests.builders.sessions import Unit, twin, write_session
 

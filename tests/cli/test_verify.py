@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from mlbatch.cli.verify import SHOWN
-from mlbatch.verify import CHECKS
+from mlbatch.verification import CHECKS
 from tests.builders.run import ROOT, command
 from tests.builders.verify_outputs import Arrays, arrays, copied, made, npz, plus
 

@@ -15,9 +15,9 @@ FLOORS: tuple[tuple[str, ...], ...] = (
     ("batch",),
     ("api", "compare", "simulate"),
     ("page",),
-    ("python", "digest"),
+    ("python", "digests"),
     ("pipeline",),
-    ("discovery", "verify"),
+    ("discovery", "verification"),
     ("outputs",),
     ("readers", "sensors", "writers", "faults"),
     ("decode", "batching"),
@@ -81,7 +81,7 @@ def test_modules_can_be_loaded_one_after_the_other() -> None:
 def test_verify_knows_nothing_of_the_writers() -> None:
     """A fault of a writer must not be hidden by the same fault in a check."""
     by_name = {module.name: module for module in MODULES}
-    reached = {name for name in NAMES if name.partition(".")[0] == "verify"}
+    reached = {name for name in NAMES if name.partition(".")[0] == "verification"}
     left = list(reached)
     while left:
         for found in imports(by_name[left.pop()], NAMES):

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from mlbatch.readers import open_recording
 from mlbatch.types import StreamTable
-from mlbatch.verify import verify
+from mlbatch.verification import verify
 from tests.builders.run import command
 from tests.contract.tree import ROOT
 from tests.fuzz.framing import Part, joined, parts_of

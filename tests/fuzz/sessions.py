@@ -18,7 +18,7 @@ from pathlib import Path
 from mlbatch.discovery.discover import SensorSelection
 from mlbatch.errors import MlbatchError
 from mlbatch.pipeline.job import Job
-from mlbatch.verify import verify
+from mlbatch.verification import verify
 from tests.builders.captures import udp_frame, write_pcap
 from tests.builders.run import command, in_memory, prints
 from tests.fuzz.framing import joined, mutated_parts, parts_of

@@ -11,7 +11,7 @@ import tempfile
 from pathlib import Path
 
 import mlbatch
-from mlbatch.digest import golden_text
+from mlbatch.digests import golden_text
 from tests.builders.run import ROOT, command
 
 # Recording, rig, and options of each.

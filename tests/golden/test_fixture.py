@@ -14,7 +14,7 @@ from mcap_ros2.decoder import DecoderFactory
 
 import mlbatch
 from mlbatch.arrays import F64Array, I64Array
-from mlbatch.digest import compare, read_golden
+from mlbatch.digests import compare, read_golden
 from tests.builders.make_fixtures import END_NS, SECOND_NS, START_NS, TURNS
 from tests.builders.run import FIXTURE, Cloud, load, scan_files, to_file
 from tests.builders.scene import MACHINE_HIGH_M, MACHINE_LOW_M, hall

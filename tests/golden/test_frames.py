@@ -13,7 +13,7 @@ from mcap.reader import make_reader
 
 from mlbatch import ros
 from mlbatch.types import Topic
-from mlbatch.verify import Verdict, verify
+from mlbatch.verification import Verdict, verify
 from tests.builders.bags import Body, Recorded, fixture_messages, transforms_message
 from tests.builders.rewritten_outputs import Sent, mcap, only
 from tests.builders.run import TWO_LIDARS, command

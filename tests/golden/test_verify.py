@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from mlbatch.outputs.stored_scan import COLUMN_NS
-from mlbatch.verify import CHECKS, Verdict, verify
+from mlbatch.verification import CHECKS, Verdict, verify
 from tests.builders.captures import udp_frame, write_pcap
 from tests.builders.points import STAMP_NS, VELODYNE, cloud_message, write_points
 from tests.builders.rosbag2 import write_rosbag2

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from mlbatch.verify import verify
+from mlbatch.verification import verify
 from tests.builders.run import (
     Told,
     command,

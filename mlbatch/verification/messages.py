@@ -18,8 +18,8 @@ from mlbatch.outputs.containers import Message
 from mlbatch.outputs.damage import CheckLog, DamageError
 from mlbatch.outputs.encoding import MessageCursor
 from mlbatch.outputs.metadata import RunMetadata
-from mlbatch.verify.examination import Examination
-from mlbatch.verify.report_checks import Document, poses_of
+from mlbatch.verification.examination import Examination
+from mlbatch.verification.report_checks import Document, poses_of
 
 IMU = "sensor_msgs/Imu"
 TRANSFORMS = "tf2_msgs/TFMessage"

@@ -14,7 +14,7 @@ import zstandard
 
 from mlbatch.outputs.damage import DamageError
 from mlbatch.outputs.mcap_file import unpacked
-from mlbatch.verify import VerifyError, verify
+from mlbatch.verification import VerifyError, verify
 from tests.builders.verify_outputs import Case, Edit, cases, check_case, damaged, made, raw
 
 MB = 1 << 20

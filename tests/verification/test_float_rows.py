@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mlbatch.verify import verify
+from mlbatch.verification import verify
 from tests.builders.verify_outputs import (
     Case,
     Edit,

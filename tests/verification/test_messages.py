@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mlbatch.verify import verify
+from mlbatch.verification import verify
 from tests.builders.rewritten_outputs import (
     Change,
     Notes,

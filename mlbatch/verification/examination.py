@@ -10,7 +10,7 @@ from typing import NamedTuple
 from mlbatch.outputs.damage import CheckLog
 from mlbatch.outputs.metadata import RunMetadata
 from mlbatch.outputs.stored_scan import StoredScan
-from mlbatch.verify.report_checks import (
+from mlbatch.verification.report_checks import (
     ReportFiles,
     check_ledgers,
     check_period,
@@ -18,7 +18,7 @@ from mlbatch.verify.report_checks import (
     grid_of,
     poses_of,
 )
-from mlbatch.verify.scan_checks import (
+from mlbatch.verification.scan_checks import (
     DuplicateColumns,
     GeometryChecks,
     GridChecks,
@@ -28,7 +28,7 @@ from mlbatch.verify.scan_checks import (
     fits_columns,
     valid_points,
 )
-from mlbatch.verify.table import OutputTotals, Table, check_table
+from mlbatch.verification.table import OutputTotals, Table, check_table
 
 # Called with the number of scans checked, and of all scans (0: unknown).
 Progress = Callable[[int, int], object]

@@ -9,7 +9,7 @@ from typing import Any, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
-from mlbatch.digest.values import Json, mean, values
+from mlbatch.digests.values import Json, mean, values
 from mlbatch.outputs.scan import Scan
 
 Values: TypeAlias = npt.NDArray[Any]

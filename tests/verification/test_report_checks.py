@@ -8,7 +8,7 @@ import pytest
 
 from mlbatch.outputs.damage import CheckLog
 from mlbatch.outputs.metadata import metadata_of_grid
-from mlbatch.verify import VerifyError, verify
+from mlbatch.verification import VerifyError, verify
 from tests.builders.verify_outputs import (
     PERIOD_NS,
     Case,

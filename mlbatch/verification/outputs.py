@@ -17,11 +17,11 @@ from mlbatch.outputs.float_rows import RowReader
 from mlbatch.outputs.folders import scan_files
 from mlbatch.outputs.kinds import kind_of
 from mlbatch.outputs.metadata import RunMetadata, metadata_of_grid
-from mlbatch.verify import messages
-from mlbatch.verify.examination import Examination, Progress
-from mlbatch.verify.messages import LAYOUT_LIMITS, TopicChecks
-from mlbatch.verify.report_checks import TABLE, ReportFiles, ReportPlaces
-from mlbatch.verify.verdict import Verdict, outcomes
+from mlbatch.verification import messages
+from mlbatch.verification.examination import Examination, Progress
+from mlbatch.verification.messages import LAYOUT_LIMITS, TopicChecks
+from mlbatch.verification.report_checks import TABLE, ReportFiles, ReportPlaces
+from mlbatch.verification.verdict import Verdict, outcomes
 
 if TYPE_CHECKING:
     from mlbatch.outputs.rosbag2 import BagFile

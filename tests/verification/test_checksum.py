@@ -15,7 +15,7 @@ from mlbatch.pipeline import conversion
 from mlbatch.pipeline.conversion import Conversion
 from mlbatch.pipeline.decode_pool import Decoded, DecodeTask, DecodeWorker
 from mlbatch.types import Scan
-from mlbatch.verify import verify
+from mlbatch.verification import verify
 from tests.builders.run import TWO_LIDARS, command
 from tests.builders.verify_outputs import (
     COMMON,

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from tests.builders.run import ROOT, TWO_LIDARS
-from tests.digest.test_digest import MOVED, RIG, other_rig
+from tests.digests.test_digest import MOVED, RIG, other_rig
 
 TEST = """
 import mlbatch

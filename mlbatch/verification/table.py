@@ -14,7 +14,7 @@ import numpy as np
 from mlbatch.arrays import BoolArray, F64Array, I64Array
 from mlbatch.outputs.damage import CheckLog
 from mlbatch.outputs.stored_scan import COLUMN_NS, Points, StoredScan
-from mlbatch.verify.scan_checks import Grid
+from mlbatch.verification.scan_checks import Grid
 
 _FIRST = ("index", "slice", "start_ns", "end_ns", "first_stamp_ns", "last_stamp_ns")
 _COUNTS = ("points", "columns")

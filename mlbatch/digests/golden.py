@@ -8,9 +8,9 @@ from pathlib import Path
 
 import mlbatch
 from mlbatch.bounded import parse_json, read_text
-from mlbatch.digest.fields import COLUMN_FIELDS, describe, fields_of
-from mlbatch.digest.run import describe_run, run_files
-from mlbatch.digest.values import Json, values
+from mlbatch.digests.fields import COLUMN_FIELDS, describe, fields_of
+from mlbatch.digests.run import describe_run, run_files
+from mlbatch.digests.values import Json, values
 from mlbatch.errors import RecordingError
 from mlbatch.outputs.read import read
 from mlbatch.outputs.run_files import RunFiles

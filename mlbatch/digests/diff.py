@@ -10,10 +10,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from mlbatch.digest.comparison import Difference, scan_name, walk
-from mlbatch.digest.fields import Values, fields_of
-from mlbatch.digest.run import describe_run, run_files
-from mlbatch.digest.values import Json, values
+from mlbatch.digests.comparison import Difference, scan_name, walk
+from mlbatch.digests.fields import Values, fields_of
+from mlbatch.digests.run import describe_run, run_files
+from mlbatch.digests.values import Json, values
 from mlbatch.errors import UsageError
 from mlbatch.outputs.read import read
 from mlbatch.outputs.scan import Scan

@@ -11,9 +11,9 @@ from os import PathLike
 from pathlib import Path
 from types import ModuleType
 
-from mlbatch.digest.comparison import Comparison, Difference, compare
-from mlbatch.digest.golden import SCHEMA, golden_of, golden_text, read_golden
-from mlbatch.digest.values import Json
+from mlbatch.digests.comparison import Comparison, Difference, compare
+from mlbatch.digests.golden import SCHEMA, golden_of, golden_text, read_golden
+from mlbatch.digests.values import Json
 
 __all__ = [
     "SCHEMA",

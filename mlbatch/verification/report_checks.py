@@ -16,8 +16,8 @@ from mlbatch.outputs.damage import CheckLog, VerifyError
 from mlbatch.outputs.metadata import RunMetadata, with_variants
 from mlbatch.types import VARIANTS
 from mlbatch.units import parse_rate
-from mlbatch.verify.scan_checks import Grid
-from mlbatch.verify.table import OutputTotals, Table, read_table
+from mlbatch.verification.scan_checks import Grid
+from mlbatch.verification.table import OutputTotals, Table, read_table
 
 REPORT = "report.json"
 TABLE = "scans.csv"

@@ -13,10 +13,10 @@ from pathlib import Path
 from types import ModuleType
 
 from mlbatch.outputs.damage import CheckLog, VerifyError, Violation
-from mlbatch.verify.examination import Progress
-from mlbatch.verify.outputs import Output, check_output
-from mlbatch.verify.report_checks import ReportPlaces
-from mlbatch.verify.verdict import CHECKS, Check, Verdict
+from mlbatch.verification.examination import Progress
+from mlbatch.verification.outputs import Output, check_output
+from mlbatch.verification.report_checks import ReportPlaces
+from mlbatch.verification.verdict import CHECKS, Check, Verdict
 
 __all__ = ["CHECKS", "Check", "Verdict", "VerifyError", "Violation", "verify"]
 

@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 
 import mlbatch
-from mlbatch.digest import compare, golden_text, read_golden
-from mlbatch.digest.fields import describe
+from mlbatch.digests import compare, golden_text, read_golden
+from mlbatch.digests.fields import describe
 from mlbatch.errors import MlbatchError
 from tests.builders.run import TWO_LIDARS, command
 from tests.golden.digest_recordings import rig_of, write_recordings

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 
-from mlbatch.digest.values import Json
+from mlbatch.digests.values import Json
 
 # Extrinsics are float64 of the rig: the same to all but the last digits.
 _POSE = "body_from_sensor"

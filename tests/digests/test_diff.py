@@ -12,9 +12,9 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from mlbatch.digest.diff import diff
+from mlbatch.digests.diff import diff
 from tests.builders.run import command
-from tests.digest.test_digest import FORMATS, MOVED, convert, other_rig
+from tests.digests.test_digest import FORMATS, MOVED, convert, other_rig
 
 Array = npt.NDArray[Any]
 

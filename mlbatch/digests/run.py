@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from mlbatch.bounded import parse_json
-from mlbatch.digest.values import Json
+from mlbatch.digests.values import Json
 from mlbatch.errors import RecordingError
 from mlbatch.outputs.run_files import RunFiles
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from mlbatch.verify import VerifyError, verify
+from mlbatch.verification import VerifyError, verify
 from tests.builders.verify_outputs import (
     Edit,
     both,

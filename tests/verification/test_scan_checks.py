@@ -8,7 +8,7 @@ from math import ceil
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mlbatch.verify.scan_checks import Grid
+from mlbatch.verification.scan_checks import Grid
 
 RATES = st.fractions(Fraction(1, 4), 1000, max_denominator=1001)
 
