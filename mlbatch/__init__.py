@@ -37,18 +37,16 @@ _PLACES = {
     "Recording": "mlbatch.python.recording",
     "Run": "mlbatch.python.run",
     "Scan": "mlbatch.outputs.scan",
+    "digest": "mlbatch.digests",
+    "verify": "mlbatch.verification",
     **dict.fromkeys(("convert", "inspect", "open", "read", "scans"), "mlbatch.api"),
 }
-_CALLABLE_PACKAGES = {"digest": "digests", "verify": "verification"}
 
 
 def __getattr__(name: str) -> object:
     """Load what is asked for: `mlbatch --help` must not wait for numpy."""
     import importlib
 
-    if name in _CALLABLE_PACKAGES:
-        # Importing them replaces any function of their name here.
-        return importlib.import_module(f"mlbatch.{_CALLABLE_PACKAGES[name]}")
     if name not in _PLACES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     return getattr(importlib.import_module(_PLACES[name]), name)

@@ -6,10 +6,8 @@ every difference, and by a few statistics and four points, which explain it with
 
 from __future__ import annotations
 
-import sys
 from os import PathLike
 from pathlib import Path
-from types import ModuleType
 
 from mlbatch.digests.comparison import Comparison, Difference, compare
 from mlbatch.digests.golden import SCHEMA, golden_of, golden_text, read_golden
@@ -32,13 +30,3 @@ def digest(output: str | PathLike[str]) -> dict[str, Json]:
     Raises RecordingError where the output is damaged, or not one of mlbatch.
     """
     return golden_of(Path(output))
-
-
-class _CallableModule(ModuleType):
-    """`mlbatch.digest(path)`, although `mlbatch.digest` is this package."""
-
-    def __call__(self, output: str | PathLike[str]) -> dict[str, Json]:
-        return digest(output)
-
-
-sys.modules[__name__].__class__ = _CallableModule

@@ -7,10 +7,8 @@ the writers is not hidden by the same fault here.
 
 from __future__ import annotations
 
-import sys
 from os import PathLike
 from pathlib import Path
-from types import ModuleType
 
 from mlbatch.outputs.damage import CheckLog, VerifyError, Violation
 from mlbatch.verification.examination import Progress
@@ -50,15 +48,3 @@ def verify(
     if unfinished.exists():
         log.fail("container", unfinished.name, "no unfinished run next to the output", "one")
     return check_output(Output(path, ReportPlaces.of(path, report), log, progress))
-
-
-class _CallableModule(ModuleType):
-    """`mlbatch.verify(path)`, although `mlbatch.verify` is this package."""
-
-    def __call__(
-        self, path: str | PathLike[str], report: str | PathLike[str] | None = None
-    ) -> Verdict:
-        return verify(path, report)
-
-
-sys.modules[__name__].__class__ = _CallableModule
