@@ -1,14 +1,12 @@
-"""Seeded damage of what a conversion reads: frames, payloads, files, texts."""
+"""Seeded damage of what a conversion reads: frames and payloads."""
 
 from __future__ import annotations
 
-import json
 import random
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from typing import TypeAlias
 
-from tests.builders.captures import pcap_bytes
 from tests.builders.traffic import Datagram, Records
 from tests.builders.two_lidars import COLUMNS_PER_PACKET
 
@@ -121,111 +119,3 @@ def with_jumps(rng: random.Random, records: Records) -> Records:
         shift_ns += jump_ns if chance > 0.995 else 0
         out.append((host_ns + shift_ns + once_ns, frame))
     return out
-
-
-def damaged_file(rng: random.Random, records: Iterable[tuple[int, bytes]]) -> bytes:
-    """A pcap with flipped bits in its headers, holes, or a cut end."""
-    data = bytearray(pcap_bytes(records))
-    for _ in range(rng.choice([1, 3, 30])):
-        at = rng.randrange(len(data))
-        what = rng.randrange(4)
-        if what == 0:
-            data[at] ^= 1 << rng.randrange(8)
-        elif what == 1:
-            del data[at : at + rng.choice([1, 16, 1000])]
-        elif what == 2:
-            data[at:at] = bytes(rng.choice([1, 16, 1000]))
-        else:
-            data[rng.randrange(200)] ^= 1 << rng.randrange(8)
-    return bytes(data[: rng.randrange(len(data))] if rng.random() < 0.3 else data)
-
-
-# -- texts ----------------------------------------------------------------------------------------
-
-WORDS = ("", "null", "-1", "0", "1e308", "NaN", "[]", "{}", '"x"', "1" * 30, "true", "\x00", "é")
-
-
-def damaged_text(rng: random.Random, text: str) -> str:
-    """Characters flipped, removed, repeated, replaced by odd words, or the end cut off."""
-    for _ in range(rng.choice([1, 1, 2, 5])):
-        at = rng.randrange(max(len(text), 1))
-        length = rng.choice([1, 1, 3, 20])
-        middle = rng.choice(
-            [
-                chr(rng.choice([9, 10, 32, 34, 44, 58, 91, 93, 123, 125, rng.randrange(33, 127)])),
-                "",
-                text[at : at + length] * 2,
-                rng.choice(WORDS),
-            ]
-        )
-        text = text[:at] + middle + text[at + length :]
-    return text if rng.random() < 0.9 else text[: rng.randrange(len(text) + 1)]
-
-
-Json: TypeAlias = bool | int | float | str | list["Json"] | dict[str, "Json"] | None
-# Each is a document of its own: a replaced value may be changed again.
-VALUES = (
-    "null",
-    "true",
-    "-1",
-    "0",
-    "1",
-    "3",
-    "17",
-    "65536",
-    "2147483648",
-    "1180591620717411303424",
-    "0.5",
-    "1e308",
-    "NaN",
-    "Infinity",
-    '""',
-    '"x"',
-    '"512x10"',
-    '"LEGACY"',
-    "[]",
-    "[0]",
-    "[1, 2, 3, 4]",
-    "{}",
-    '{"a": 1}',
-)
-
-
-def damaged_json(rng: random.Random, text: str) -> str:
-    """A document whose values, one to three of them, are replaced, removed or repeated."""
-    document: Json = json.loads(text)
-    for _ in range(rng.choice([1, 1, 2, 3])):
-        _change_one(rng, document)
-    return json.dumps(document)
-
-
-def _change_one(rng: random.Random, document: Json) -> None:
-    places: list[tuple[Json, str | int]] = []
-    _walk(document, places)
-    holder, key = rng.choice(places)
-    if isinstance(holder, dict) and isinstance(key, str):
-        if rng.random() < 0.2:
-            del holder[key]
-        else:
-            holder[key] = json.loads(rng.choice(VALUES))
-    elif isinstance(holder, list) and isinstance(key, int):
-        if rng.random() < 0.3:
-            del holder[key]
-        elif rng.random() < 0.3:
-            holder.insert(key, holder[key])
-        else:
-            holder[key] = json.loads(rng.choice(VALUES))
-
-
-def _walk(value: Json, places: list[tuple[Json, str | int]]) -> None:
-    keys: Iterable[str | int] = ()
-    if isinstance(value, dict):
-        keys = list(value)
-        places += [(value, key) for key in keys]
-        for item in value.values():
-            _walk(item, places)
-    elif isinstance(value, list):
-        # Long lists would otherwise take all the damage.
-        places += [(value, key) for key in range(min(len(value), 2))]
-        for item in value[:2]:
-            _walk(item, places)

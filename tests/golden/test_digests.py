@@ -15,7 +15,6 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-import io
 import itertools
 import json
 import os
@@ -26,12 +25,10 @@ import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from unittest.mock import patch
 
 import pytest
 
-from mlbatch.cli import app, main
-from tests.builders.parser import parser
+from tests.builders.run import command
 from tests.golden.digest_outputs import Digests
 from tests.golden.digest_recordings import (
     CONTAINERS,
@@ -263,36 +260,6 @@ WORDED_QUERIES = (
 )
 
 
-@dataclass(frozen=True, slots=True)
-class Said:
-    """What a command printed."""
-
-    code: int
-    out: str
-    err: str
-
-
-def command(*words: str) -> Said:
-    """Run `mlbatch` with these words in this process."""
-    out = io.StringIO()
-    err = io.StringIO()
-    before = sys.argv
-    sys.argv = ["mlbatch", *words]
-    code: object = 0
-    try:
-        with (
-            patch.object(app, "command_line", parser),
-            contextlib.redirect_stdout(out),
-            contextlib.redirect_stderr(err),
-        ):
-            main()
-    except SystemExit as leave:
-        code = leave.code
-    finally:
-        sys.argv = before
-    return Said(code if isinstance(code, int) else 0, out.getvalue(), err.getvalue())
-
-
 @contextlib.contextmanager
 def inside(folder: Path) -> Iterator[None]:
     """Work in a folder: paths in outputs are then relative."""
@@ -372,6 +339,7 @@ def digests_of(case: Case, run: Run) -> Digests:
         for path in sorted(made.glob("out*")):
             if path.is_dir() or path.suffix in _SUFFIX.values():
                 verdict = json.loads(command("verify", str(path), "--json").out)
+                assert verdict["ok"], verdict["violations"]
                 found.add_json(verdict, f"verify {path.name}")
     return found
 

@@ -27,7 +27,7 @@ from mlbatch.simulate.robosense.encode import (
 )
 from tests.builders.bags import Recorded
 from tests.builders.rosbag2 import Form, write_rosbag2
-from tests.builders.run import command, in_memory
+from tests.builders.run import in_memory
 from tests.builders.sessions_of_bags import write_mcap
 from tests.builders.vendor_sessions import Payloads, robosense_scan
 
@@ -88,15 +88,6 @@ def test_a_real_helios_is_decoded(container: str, tmp_path: Path) -> None:
     wanted_m = range_m * directions(UNIT, ANGLES, columns) + origins(UNIT, columns)
     xyz_m = np.concatenate([scan.xyz for scan in scans]).reshape(COLUMNS, 32, 3)
     assert np.abs(xyz_m - wanted_m).max() < range_m.max() * np.radians(MOST_DEG)
-
-
-def test_the_number_of_jobs_does_not_matter(tmp_path: Path) -> None:
-    path = WRITERS["db3"](tmp_path, messages(payloads()))
-    for jobs in ("1", "3"):
-        assert command("convert", path, "-o", tmp_path / f"{jobs}", "--jobs", jobs).code == 0
-    one, three = (sorted((tmp_path / f"{jobs}").glob("*.npz")) for jobs in "13")
-    assert [path.name for path in one] == [path.name for path in three] != []
-    assert [path.read_bytes() for path in one] == [path.read_bytes() for path in three]
 
 
 RIG = """\

@@ -1,4 +1,7 @@
-"""Damaged inputs: every run balances its ledgers or ends in one clear line, and soon."""
+"""Damaged packets: every run balances its ledgers or ends in one clear line, and soon.
+
+Damaged files, rigs and metadata: tests/fuzz.
+"""
 
 from __future__ import annotations
 
@@ -7,7 +10,7 @@ import json
 import random
 import re
 import signal
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
@@ -25,12 +28,9 @@ from tests.builders.captures import pcap_bytes
 from tests.builders.damage import (
     NAMES,
     damaged,
-    damaged_file,
     damaged_frames,
     damaged_heads,
-    damaged_json,
     damaged_payloads,
-    damaged_text,
     with_jumps,
 )
 from tests.builders.run import (
@@ -54,7 +54,6 @@ LONGEST_S = 300
 BUFFERS = (9_000, 50_000)
 # Source IP in an Ethernet frame.
 SENDER = slice(26, 30)
-RIG = "rig.yaml"
 LIDARS = ("left.json", "right.json")
 
 JOBS = (
@@ -94,7 +93,6 @@ def within(seconds: int) -> Iterator[None]:
 
 
 Outcome = tuple[str, list[Values]]
-Damage = Callable[[random.Random, str], str]
 
 
 def outcome(job: Job, frames_given: int | None = None) -> Outcome:
@@ -267,48 +265,3 @@ def test_counts_are_exactly_the_damage(name: str, tmp_path: Path) -> None:
         # Loss at the ends cannot be known.
         assert packets.lost == there[-1] - there[0] + 1 - len(there)
         assert len(there) < len(own) or rejected["duplicate"]
-
-
-@pytest.mark.parametrize("seed", range(40))
-def test_damaged_files(seed: int, tmp_path: Path) -> None:
-    rng = random.Random(f"file {seed}")
-    path = tmp_path / "damaged.pcap"
-    path.write_bytes(damaged_file(rng, frames(LENGTH_NS)))
-    both_buffers(replace(rng.choice(JOBS), recordings=(path,)), None, rng.choice(BUFFERS))
-
-
-@pytest.fixture(scope="module")
-def short(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A sound recording of some packets."""
-    path = tmp_path_factory.mktemp("short") / "short.pcap"
-    path.write_bytes(pcap_bytes([one.frame() for one in datagrams(90_000_000)]))
-    return path
-
-
-def set_up(folder: Path, name: str, text: str) -> Path:
-    """Rig and metadata in a folder, one of them with another text; the rig's path."""
-    for other in (RIG, *LIDARS):
-        (folder / other).write_bytes((TWO_LIDARS / other).read_bytes())
-    (folder / name).write_text(text, encoding="utf-8", newline="")
-    return folder / RIG
-
-
-@pytest.mark.parametrize("seed", range(60))
-@pytest.mark.parametrize("kind", [damaged_text, damaged_json])
-def test_damaged_metadata(kind: Damage, seed: int, short: Path, tmp_path: Path) -> None:
-    rng = random.Random(f"metadata {kind.__name__} {seed}")
-    name = rng.choice(LIDARS)
-    rig = set_up(tmp_path, name, kind(rng, (TWO_LIDARS / name).read_text(encoding="utf-8")))
-    outcome(replace(FIXTURE, recordings=(short,), selection=SensorSelection(rig=rig)))
-    given = SensorSelection(
-        metadata=tuple(tmp_path / one for one in LIDARS), identity_extrinsics=True
-    )
-    outcome(replace(FIXTURE, recordings=(short,), selection=given))
-
-
-@pytest.mark.parametrize("seed", range(60))
-def test_damaged_rigs(seed: int, short: Path, tmp_path: Path) -> None:
-    rng = random.Random(f"rig {seed}")
-    text = (TWO_LIDARS / RIG).read_text(encoding="utf-8")
-    rig = set_up(tmp_path, RIG, damaged_text(rng, text))
-    outcome(replace(FIXTURE, recordings=(short,), selection=SensorSelection(rig=rig)))
