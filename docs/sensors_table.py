@@ -1,6 +1,6 @@
 """Write the sensor table of docs/models.md from the models: `python docs/sensors_table.py`.
 
-Models that differ only in their name share a row.
+Models of a vendor with the same calibration and verification share a row.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from mlbatch.sensors import models
 
 PAGE = Path(__file__).resolve().parent / "models.md"
 BEGIN, END = "<!-- sensors: python docs/sensors_table.py -->", "<!-- end of sensors -->"
-HEAD = ("vendor", "models (channels)", "returns", "clock", "calibration", "verified")
+HEAD = ("vendor", "models (channels)", "calibration", "verified")
 
 
 def table() -> str:
@@ -37,8 +37,7 @@ def with_table(page: str) -> str:
 
 
 def _shared(model: SensorModel) -> tuple[str, ...]:
-    returns = ", ".join(map(str, model.returns))
-    return model.vendor, returns, model.clock, model.calibration, model.verified
+    return model.vendor, model.calibration, model.verified
 
 
 def _name(model: SensorModel) -> str:
