@@ -25,7 +25,7 @@ from tests.builders.two_lidars import (
     imu_packet,
     metadata,
     packets,
-    turn_pixels,
+    turn_fields,
 )
 
 FOLDER = Path(__file__).resolve().parents[2] / "fixtures" / "two_lidars"
@@ -83,15 +83,14 @@ def main(folder: Path) -> None:
 def lidar_frames(lidar: FixtureLidar) -> Records:
     """Receive time and bytes of every frame that a lidar sends, lidar and IMU packets."""
     stamps = column_stamps(lidar, SECOND_NS, TURNS)
-    raw = packets(lidar, turn_pixels(lidar, hall()), stamps)
+    raw = packets(lidar, turn_fields(lidar, hall()), stamps)
     bounds = stamps.reshape(-1, COLUMNS_PER_PACKET)[:, [0, -1]]
     kept = np.flatnonzero((bounds[:, 0] >= START_NS) & (bounds[:, 1] < END_NS))
     # The network's delay varies by up to 0.1 ms.
-    sent = [
+    payloads = [
         (int(bounds[i, 1]) + LATENCY_NS[lidar.name] + int(i) * 37 % 11 * 10_000, 7502, raw[i])
         for i in kept
     ]
-    payloads = [(host_ns, port, packet.tobytes()) for host_ns, port, packet in sent]
     first_imu_ns = START_NS + lidar.zero_ms * NS_PER_MS % IMU_STEP_NS
     payloads += [
         (stamp_ns + 150 * NS_PER_US, 7503, imu_packet(lidar, stamp_ns))

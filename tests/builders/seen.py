@@ -216,25 +216,25 @@ def robosense_sees(
 
 def ouster_sees(lidar: two_lidars.FixtureLidar, eye: Eye, first_ns: int, turns: int) -> Seen:
     """An Ouster: its encoder casts the rays itself, from its own pose."""
-    pixels = two_lidars.turn_pixels(lidar, eye.scene)
+    fields = two_lidars.turn_fields(lidar, eye.scene)
     stamps = two_lidars.column_stamps(lidar, first_ns, turns)
-    raw = two_lidars.packets(lidar, pixels, stamps)
+    raw = two_lidars.packets(lidar, fields, stamps)
     column = np.arange(len(stamps)) % two_lidars.COLUMNS_PER_TURN
     last_ns = stamps.reshape(-1, two_lidars.COLUMNS_PER_PACKET)[:, -1]
-    counts = pixels["range"].astype(np.int64)
+    counts = fields["RANGE"] // lidar.range_step_mm
     unit_m = lidar.range_step_mm / 1000
     # Ranges count from the rotor's axis, along the beam.
     origin, direction = two_lidars.rays(lidar)
     reached_m = counts.reshape(-1, 1) * unit_m - lidar.offset_mm / 1000
-    xyz_m = (origin + reached_m * direction).reshape(*pixels.shape, 1, 3)
+    xyz_m = (origin + reached_m * direction).reshape(*counts.shape, 1, 3)
     return Seen(
         stamps,
         np.repeat(stamps[:, None], two_lidars.BEAMS, axis=1),
         counts[column][:, :, None],
-        pixels["reflectivity"][column].astype(np.int64)[:, :, None],
+        fields["REFLECTIVITY"][column][:, :, None],
         xyz_m[column],
         unit_m,
-        [(int(at), row.tobytes()) for at, row in zip(last_ns, raw, strict=True)],
+        list(zip(last_ns.tolist(), raw, strict=True)),
         two_lidars.COLUMNS_PER_PACKET,
     )
 

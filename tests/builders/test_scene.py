@@ -3,24 +3,17 @@
 from __future__ import annotations
 
 import hashlib
-import json
 import math
-import struct
 import subprocess
 import sys
-from collections import defaultdict
-from collections.abc import Iterator
 from pathlib import Path
 
-import dpkt
 import numpy as np
 import pytest
-import yaml
 from matplotlib.image import imread
 
 from tests.builders.make_fixtures import FOLDER, main
 from tests.builders.scene import Pillar, Rectangle, Scene, Vector, box, hall
-from tests.builders.two_lidars import LEFT, RIGHT, FixtureLidar, body_from_sensor, crc64
 
 DOCS = Path(__file__).resolve().parents[2] / "docs"
 
@@ -71,14 +64,6 @@ def test_ray_meets_what_geometry_says(
     assert cast_one(scene, origin, direction) == pytest.approx(expected, abs=1e-12)
 
 
-def test_rays_are_cast_each_for_itself() -> None:
-    origins = np.zeros((3, 3))
-    directions = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.8, 0.0, 0.6]])
-    # The third meets the plane x = 4 at z = 3, above the shield.
-    assert SHIELD.cast(origins, directions).tolist() == [4.0, math.inf, math.inf]
-    assert SHIELD.surface_hit(origins, directions).tolist() == [0, -1, -1]
-
-
 @pytest.mark.parametrize(
     ("scene", "point", "expected"),
     [
@@ -127,125 +112,6 @@ def test_fixture_is_made_again_to_the_byte(tmp_path: Path) -> None:
 
 def digest(path: Path) -> str:
     return hashlib.sha256(path.read_bytes()).hexdigest()
-
-
-def test_crc_has_the_published_check_value() -> None:
-    digits = np.frombuffer(b"123456789", np.uint8)[None, :]
-    # CRC-64/XZ in the catalogue of parametrised CRC algorithms.
-    assert crc64(digits).tolist() == [0x995DC9BBDF1939FA]
-
-
-def datagrams() -> Iterator[tuple[int, int, bytes]]:
-    """Last byte of the source address, destination port and payload, reassembled frame by frame."""
-    parts: dict[tuple[bytes, int], bytes] = defaultdict(bytes)
-    with (FOLDER / "two_lidars.pcap").open("rb") as file:
-        for _, frame in dpkt.pcap.Reader(file):
-            packet = dpkt.ethernet.Ethernet(frame).data
-            if not isinstance(packet, dpkt.ip.IP) or packet.p != dpkt.ip.IP_PROTO_UDP:
-                continue
-            key = (packet.src, packet.id)
-            # The low 13 bits of the flags word count units of 8 bytes.
-            offset = (struct.unpack_from(">H", frame, 20)[0] & 0x1FFF) * 8
-            assert offset == len(parts[key])
-            parts[key] += frame[34:]
-            if not packet.mf:
-                datagram = parts.pop(key)
-                yield packet.src[3], struct.unpack_from(">H", datagram, 2)[0], datagram[8:]
-    assert not parts
-
-
-def test_capture_contains_what_its_source_file_lists() -> None:
-    seen: dict[tuple[int, int, int], int] = defaultdict(int)
-    for host, port, payload in datagrams():
-        seen[host, port, len(payload)] += 1
-    # 0.85 s contain 272 packets of 3.125 ms; the one that both ends cut is not sent.
-    # Sizes by docs/sources/ouster.md section 2: 32 beams x 12 or 4 bytes.
-    assert dict(seen) == {
-        (87, 7502, 32 + 16 * (12 + 32 * 12) + 32): 271,
-        (88, 7502, 32 + 16 * (12 + 32 * 4) + 32): 271,
-        (87, 7503, 48): 85,
-        (88, 7503, 48): 85,
-        (20, 5353, 12): 2,
-    }
-
-
-def test_rotors_pass_zero_37_ms_apart() -> None:
-    zeros: dict[int, list[int]] = defaultdict(list)
-    for host, _, payload in datagrams():
-        if len(payload) > 1000 and struct.unpack_from("<H", payload, 32 + 8)[0] == 0:
-            zeros[host].append(struct.unpack_from("<q", payload, 32)[0])
-    # 2026-05-04T08:00:00 UTC and -87 ms + 2 revolutions of 99.99 ms; the zero before is missing.
-    assert zeros[87][0] == 1_777_881_600_000_000_000 + 112_980_000
-    # The first zero of `right` comes 63 ms before that one.
-    apart = [right - left for left, right in zip(zeros[87], zeros[88][1:], strict=True)]
-    assert apart == [pytest.approx(37e6, abs=0.2e6)] * 8
-
-
-def test_frame_ids_of_right_wrap() -> None:
-    frames = [
-        struct.unpack_from("<H", p, 2)[0] for host, _, p in datagrams() if host == 88 and p[0]
-    ]
-    assert 65535 in frames
-    assert 0 in frames
-
-
-@pytest.mark.parametrize(
-    ("lidar", "range_of", "half_step_m"),
-    [
-        pytest.param(LEFT, ("<I", 12, 0x7FFFF, 1), 0.0005, id="left"),
-        pytest.param(RIGHT, ("<H", 4, 0x7FFF, 8), 0.004, id="right"),
-    ],
-)
-def test_points_lie_on_the_scene(
-    lidar: FixtureLidar, range_of: tuple[str, int, int, int], half_step_m: float
-) -> None:
-    layout, pixel_size, mask, step_mm = range_of
-    document = json.loads((FOLDER / f"{lidar.name}.json").read_text())
-    host = int(lidar.ip.rsplit(".", 1)[1])
-    packets = [payload for source, port, payload in datagrams() if (source, port) == (host, 7502)]
-    points = []
-    for packet in packets[::9]:
-        column = 32 + 7 * (12 + 32 * pixel_size)
-        mid = struct.unpack_from("<H", packet, column + 8)[0]
-        for beam in range(32):
-            (word,) = struct.unpack_from(layout, packet, column + 12 + beam * pixel_size)
-            if word & mask:
-                points.append(sensor_point(document, (word & mask) * step_mm, mid, beam))
-    pose = body_from_sensor(lidar)
-    body = np.array(points) @ pose[:3, :3].T + pose[:3, 3]
-    assert len(body) > 600
-    assert hall().distance_to_surfaces(body).max() <= half_step_m + 1e-9
-
-
-def sensor_point(
-    document: dict[str, dict[str, list[float]]], r: int, mid: int, beam: int
-) -> Vector:
-    """One point by the formula of docs/sources/ouster.md section 6, number by number; metres."""
-    beams = document["beam_intrinsics"]
-    n = beams["beam_to_lidar_transform"][3]
-    theta = 2 * math.pi * (1 - mid / 512)
-    a = theta - math.radians(beams["beam_azimuth_angles"][beam])
-    p = math.radians(beams["beam_altitude_angles"][beam])
-    x = (r - n) * math.cos(a) * math.cos(p) + n * math.cos(theta)
-    y = (r - n) * math.sin(a) * math.cos(p) + n * math.sin(theta)
-    z = (r - n) * math.sin(p)
-    lift = document["lidar_intrinsics"]["lidar_to_sensor_transform"][11]
-    return (-x / 1000, -y / 1000, (z + lift) / 1000)
-
-
-def test_rig_names_both_lidars_by_serial() -> None:
-    rig = yaml.safe_load((FOLDER / "rig.yaml").read_text())
-    assert [sensor["stream"]["serial"] for sensor in rig["sensors"]] == [LEFT.serial, RIGHT.serial]
-    assert rig["sensors"][0]["extrinsics"]["rotation_rpy_deg"] == list(LEFT.rpy_deg)
-
-
-def test_extrinsics_rotate_about_fixed_axes() -> None:
-    # Pitch 22 degrees lowers the x axis, then yaw 80 degrees rotates it to the left.
-    forward = body_from_sensor(LEFT)[:3, 0]
-    down = math.radians(22.0)
-    left = math.radians(80.0)
-    expected = (math.cos(left) * math.cos(down), math.sin(left) * math.cos(down), -math.sin(down))
-    assert forward.tolist() == pytest.approx(expected)
 
 
 def run(script: str, *arguments: Path) -> subprocess.CompletedProcess[str]:

@@ -1,10 +1,11 @@
-"""What is on the wire in `fixtures/two_lidars`: its frames, its datagrams, its senders."""
+"""What is on the wire in a capture, first of all `fixtures/two_lidars`: frames, datagrams."""
 
 from __future__ import annotations
 
 import functools
 import ipaddress
 import struct
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -19,13 +20,15 @@ _UDP = 17
 
 
 def read_pcap(path: Path) -> Records:
-    """(host_ns, frame) of all records of a little-endian pcap in us, as the fixture is."""
+    """(host_ns, frame) of all records of a little-endian pcap."""
     data = path.read_bytes()
+    unit_ns = {b"\xd4\xc3\xb2\xa1": 1000, b"\x4d\x3c\xb2\xa1": 1}[data[:4]]
     at = 24
     records = []
     while at < len(data):
-        seconds, us, captured, _ = struct.unpack_from("<4I", data, at)
-        records.append((seconds * 10**9 + us * 1000, data[at + 16 : at + 16 + captured]))
+        seconds, fraction, captured, _ = struct.unpack_from("<4I", data, at)
+        host_ns = seconds * 10**9 + fraction * unit_ns
+        records.append((host_ns, data[at + 16 : at + 16 + captured]))
         at += 16 + captured
     return records
 
@@ -63,15 +66,21 @@ class Datagram:
 
 @functools.cache
 def datagrams(length_ns: int) -> tuple[Datagram, ...]:
-    """Datagrams of `frames`, whose fragments come in order, as they were completed."""
+    """Datagrams of `frames`."""
+    return tuple(datagrams_of(frames(length_ns)))
+
+
+def datagrams_of(records: Iterable[tuple[int, bytes]]) -> list[Datagram]:
+    """UDP datagrams over IPv4, as they were completed; fragments come in order."""
     parts: dict[bytes, bytes] = {}
     found = []
-    for host_ns, frame in frames(length_ns):
+    for host_ns, frame in records:
         if frame[12:14] != _IPV4 or frame[23] != _UDP:
             continue
         # Identification and both addresses identify the fragments of a datagram.
         key = frame[18:20] + frame[26:34]
-        parts[key] = parts.get(key, b"") + frame[34:]
+        end = 14 + struct.unpack_from(">H", frame, 16)[0]
+        parts[key] = parts.get(key, b"") + frame[34:end]
         if struct.unpack_from(">H", frame, 20)[0] & 0x2000:
             continue
         whole = parts.pop(key)
@@ -79,4 +88,4 @@ def datagrams(length_ns: int) -> tuple[Datagram, ...]:
         assert size == len(whole)
         sender, target = (str(ipaddress.ip_address(frame[at : at + 4])) for at in (26, 30))
         found.append(Datagram(host_ns, sender, target, source_port, port, whole[8:]))
-    return tuple(found)
+    return found

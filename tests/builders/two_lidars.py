@@ -1,39 +1,26 @@
-"""The two lidars of `fixtures/two_lidars`: geometry, metadata and packet bytes.
+"""The two lidars of `fixtures/two_lidars`: geometry, metadata and packets.
 
-Source: docs/sources/ouster.md sections 1 (metadata), 2 and 3 (packets), 6 (range to xyz), 8 (IMU).
-The bytes are laid out here once more, apart from the package, so that the fixture can check it.
+Source: docs/sources/ouster.md sections 1 (metadata), 6 (range to xyz), 8 (IMU). The bytes of the
+fixture were laid out by hand; the encoder of simulate must make them again.
 """
 
 from __future__ import annotations
 
 import math
 import struct
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
-from mlbatch.arrays import BoolArray, F64Array, I64Array, U8Array
+from mlbatch.arrays import F64Array, I64Array
+from mlbatch.simulate.ouster.encode import IntLike, OusterSpec, encode_packets
 from tests.builders.scene import Scene
 
 COLUMNS_PER_TURN = 512
 COLUMNS_PER_PACKET = 16
 BEAMS = 32
-PACKETS_PER_TURN = COLUMNS_PER_TURN // COLUMNS_PER_PACKET
 MM_PER_M = 1000.0
-
-# Section 3: first bit and width of every field, as little-endian members of a pixel.
-LOW_PIXEL = np.dtype([("range", "<u2"), ("reflectivity", "u1"), ("near_ir", "u1")])
-FULL_PIXEL = np.dtype(
-    [
-        ("range", "<u4"),
-        ("reflectivity", "u1"),
-        ("unused", "u1"),
-        ("signal", "<u2"),
-        ("near_ir", "<u2"),
-        ("window", "<u2"),
-    ]
-)
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,7 +39,6 @@ class FixtureLidar:
     init_id: int
     ip: str
     profile: str
-    pixel: np.dtype[np.void]
     altitude_span_deg: float
     offset_mm: float
     lift_mm: float
@@ -64,6 +50,18 @@ class FixtureLidar:
     translation_m: tuple[float, float, float]
     rpy_deg: tuple[float, float, float]
 
+    @property
+    def spec(self) -> OusterSpec:
+        """The sensor that its packets are of."""
+        return OusterSpec(
+            self.profile,
+            BEAMS,
+            COLUMNS_PER_TURN,
+            COLUMNS_PER_PACKET,
+            serial=int(self.serial),
+            init_id=self.init_id,
+        )
+
 
 # The rotors pass zero 37 ms apart and rotate at slightly different speeds, as real ones do. The
 # frame ids of `right` wrap within the recording.
@@ -74,7 +72,6 @@ LEFT = FixtureLidar(
     init_id=4660341,
     ip="10.5.5.87",
     profile="RNG19_RFL8_SIG16_NIR16",
-    pixel=FULL_PIXEL,
     altitude_span_deg=44.5,
     offset_mm=27.67,
     lift_mm=36.18,
@@ -93,7 +90,6 @@ RIGHT = FixtureLidar(
     init_id=7713026,
     ip="10.5.5.88",
     profile="RNG15_RFL8_NIR8",
-    pixel=LOW_PIXEL,
     altitude_span_deg=22.4,
     offset_mm=15.806,
     lift_mm=38.195,
@@ -163,8 +159,8 @@ def rays(lidar: FixtureLidar) -> tuple[F64Array, F64Array]:
     )
 
 
-def turn_pixels(lidar: FixtureLidar, scene: Scene) -> npt.NDArray[np.void]:
-    """Pixels (columns, beams) of any revolution, as nothing moves; range 0 where nothing is hit."""
+def turn_fields(lidar: FixtureLidar, scene: Scene) -> dict[str, I64Array]:
+    """Fields (columns, beams) of any revolution, as nothing moves; range 0 where nothing is hit."""
     origins, directions = rays(lidar)
     distance_m = scene.cast(origins, directions)
     surface = scene.surface_hit(origins, directions)
@@ -172,14 +168,17 @@ def turn_pixels(lidar: FixtureLidar, scene: Scene) -> npt.NDArray[np.void]:
     brightness = np.array([surface.reflectivity for surface in scene.surfaces] + [0])[surface]
     # The sensor counts the range from the rotor's axis, along the beam.
     range_mm = np.where(hit, distance_m * MM_PER_M + lidar.offset_mm, 0.0)
-    pixels = np.zeros(len(hit), lidar.pixel)
-    pixels["range"] = np.round(range_mm / lidar.range_step_mm)
-    pixels["reflectivity"] = brightness
-    pixels["near_ir"] = np.where(hit, 320, 2400) // lidar.near_ir_step
-    if "signal" in (lidar.pixel.names or ()):
-        nearest_m = np.where(hit, np.maximum(distance_m, 1.0), 1.0)
-        pixels["signal"] = np.round(brightness * 200 / nearest_m**2)
-    return pixels.reshape(COLUMNS_PER_TURN, BEAMS)
+    nearest_m = np.where(hit, np.maximum(distance_m, 1.0), 1.0)
+    near_ir = np.where(hit, 320, 2400) // lidar.near_ir_step * lidar.near_ir_step
+    fields = {
+        "RANGE": np.round(range_mm / lidar.range_step_mm) * lidar.range_step_mm,
+        "REFLECTIVITY": brightness,
+        "NEAR_IR": near_ir,
+    }
+    if lidar.range_step_mm == 1:
+        fields["SIGNAL"] = np.round(brightness * 200 / nearest_m**2)
+    shape = COLUMNS_PER_TURN, BEAMS
+    return {name: values.astype(np.int64).reshape(shape) for name, values in fields.items()}
 
 
 def column_stamps(lidar: FixtureLidar, second_ns: int, turns: int) -> I64Array:
@@ -189,45 +188,13 @@ def column_stamps(lidar: FixtureLidar, second_ns: int, turns: int) -> I64Array:
     return stamps // 10 * 10
 
 
-def packets(lidar: FixtureLidar, pixels: npt.NDArray[np.void], stamp_ns: I64Array) -> U8Array:
-    """Lidar packets (packets, bytes) of columns from mid 0 on, header STANDARD, with CRC."""
-    column = np.dtype(
-        [("stamp_ns", "<i8"), ("mid", "<u2"), ("status", "<u2"), ("pixel", lidar.pixel, BEAMS)]
-    )
-    packet = np.dtype(
-        [("head", "u1", 32), ("column", column, COLUMNS_PER_PACKET), ("foot", "u1", 32)]
-    )
-    mid = np.arange(len(stamp_ns)) % COLUMNS_PER_TURN
-    columns = np.zeros(len(stamp_ns), column)
-    columns["stamp_ns"] = stamp_ns
-    columns["mid"] = mid
-    columns["status"] = 1
-    columns["pixel"] = pixels[mid]
-    out = np.zeros(len(stamp_ns) // COLUMNS_PER_PACKET, packet)
-    out["column"] = columns.reshape(-1, COLUMNS_PER_PACKET)
-    frames = lidar.first_frame + np.arange(len(out)) // PACKETS_PER_TURN
-    out["head"] = [list(header(lidar, int(frame))) for frame in frames]
-    raw = out.view(np.uint8).reshape(len(out), packet.itemsize)
-    raw[:, -8:] = crc64(raw[:, :-8]).astype("<u8")[:, None].view(np.uint8)
-    return raw
-
-
-def header(lidar: FixtureLidar, frame: int) -> bytes:
-    """Packet type 1, frame id u16, init id u24, serial number u40; no alerts (section 2)."""
-    ids = lidar.init_id.to_bytes(3, "little") + int(lidar.serial).to_bytes(5, "little")
-    return struct.pack("<HH", 1, frame % 65536) + ids + bytes(20)
-
-
-def crc64(packets: U8Array) -> npt.NDArray[np.uint64]:
-    """CRC-64/XZ of each row, a byte of all rows at a time."""
-    table = np.arange(256, dtype=np.uint64)
-    for _ in range(8):
-        odd: BoolArray = (table & np.uint64(1)).astype(bool)
-        table = (table >> np.uint64(1)) ^ np.where(odd, np.uint64(0xC96C5795D7870F42), np.uint64(0))
-    crc = np.full(len(packets), 0xFFFFFFFFFFFFFFFF, np.uint64)
-    for byte in np.ascontiguousarray(packets.T):
-        crc = (crc >> np.uint64(8)) ^ table[((crc ^ byte) & np.uint64(0xFF)).astype(np.int64)]
-    return ~crc
+def packets(lidar: FixtureLidar, fields: Mapping[str, I64Array], stamp_ns: I64Array) -> list[bytes]:
+    """Lidar packets of columns from measurement id 0 on."""
+    number = np.arange(len(stamp_ns))
+    mids = number % COLUMNS_PER_TURN
+    frames = (lidar.first_frame + number // COLUMNS_PER_TURN) % 65536
+    values: dict[str, IntLike] = {name: one[mids] for name, one in fields.items()}
+    return encode_packets(lidar.spec, stamp_ns, mids, frames, values)
 
 
 def imu_packet(lidar: FixtureLidar, stamp_ns: int) -> bytes:

@@ -7,9 +7,7 @@ A recording is the same packets in several containers, in one folder with its ri
 from __future__ import annotations
 
 import shutil
-import struct
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -21,6 +19,7 @@ from tests.builders.points import OUSTER, STAMP_NS, Form, cloud_message, write_p
 from tests.builders.rosbag1 import write_rosbag1
 from tests.builders.rosbag2 import write_rosbag2
 from tests.builders.sessions_of_bags import packets_only, told, write_mcap
+from tests.builders.traffic import Datagram, datagrams_of, read_pcap
 from tests.golden.vendor_messages import Unit, merged, nebula, scans, singles
 from tests.matrix.containers import CONTAINERS as MATRIX_CONTAINERS
 from tests.matrix.containers import rig_text
@@ -79,50 +78,6 @@ def rig_of(recording: str, container: str) -> str:
     return "rig.yaml" if container in CAPTURES else "rig_of_topics.yaml"
 
 
-@dataclass(frozen=True, slots=True)
-class _Datagram:
-    """host_ns: receive time of the last fragment."""
-
-    host_ns: int
-    source_ip: str
-    port: int
-    payload: bytes
-
-
-def _frames(path: Path) -> list[tuple[int, bytes]]:
-    """(host_ns, frame) of a little-endian pcap."""
-    data = path.read_bytes()
-    scale = {b"\xd4\xc3\xb2\xa1": 1000, b"\x4d\x3c\xb2\xa1": 1}[data[:4]]
-    at = 24
-    found = []
-    while at < len(data):
-        seconds, fraction, captured, _ = struct.unpack_from("<4I", data, at)
-        at += 16
-        found.append((seconds * 10**9 + fraction * scale, data[at : at + captured]))
-        at += captured
-    return found
-
-
-def _datagrams(path: Path) -> list[_Datagram]:
-    """UDP datagrams over IPv4; fragments come in their order."""
-    parts: dict[bytes, bytes] = {}
-    found = []
-    for host_ns, frame in _frames(path):
-        if frame[12:14] != b"\x08\x00" or frame[23] != 17:
-            continue
-        # The identification and both addresses are those of the datagram.
-        key = frame[18:20] + frame[26:34]
-        end = 14 + struct.unpack_from(">H", frame, 16)[0]
-        parts[key] = parts.get(key, b"") + frame[34:end]
-        if struct.unpack_from(">H", frame, 20)[0] & 0x2000:
-            continue
-        whole = parts.pop(key)
-        source_ip = ".".join(map(str, frame[26:30]))
-        port = struct.unpack_from(">H", whole, 2)[0]
-        found.append(_Datagram(host_ns, source_ip, port, whole[8:]))
-    return found
-
-
 def _write_bags(folder: Path, messages: Mapping[str, Sequence[Recorded]]) -> None:
     """messages: of each container."""
     write_mcap(folder / "drive.mcap", messages["mcap"])
@@ -140,7 +95,7 @@ def _copy_fixture(folder: Path, fixture: str) -> None:
     for path in (FIXTURES / fixture).iterdir():
         if path.suffix in (".yaml", ".json", ".csv") and path.name != "expected.json":
             shutil.copy(path, folder)
-    _write_captures(folder, _frames(FIXTURES / fixture / f"{fixture}.pcap"))
+    _write_captures(folder, read_pcap(FIXTURES / fixture / f"{fixture}.pcap"))
     # The fixture's own file, not a copy of its frames.
     shutil.copy(FIXTURES / fixture / f"{fixture}.pcap", folder / "drive.pcap")
 
@@ -168,15 +123,15 @@ def _four_makers(folder: Path) -> None:
     for source_ip, ports, topic in _FOUR.values():
         rig = rig.replace(f"source_ip: {source_ip}, port: {ports[0]}", f"topic: {topic}")
     (folder / "rig_of_topics.yaml").write_text(rig, encoding="utf-8")
-    sent = _datagrams(folder / "drive.pcap")
+    sent = datagrams_of(read_pcap(folder / "drive.pcap"))
     _write_bags(folder, {container: _four_messages(sent, container) for container in BAGS})
 
 
-def _four_messages(sent: Sequence[_Datagram], container: str) -> list[Recorded]:
+def _four_messages(sent: Sequence[Datagram], container: str) -> list[Recorded]:
     encoding = "ros1" if container == "bag" else "cdr"
     parts = []
     for vendor, (source_ip, ports, topic) in _FOUR.items():
-        own = [one for one in sent if one.source_ip == source_ip and one.port in ports]
+        own = [one for one in sent if one.source == source_ip and one.port in ports]
         if vendor in ("ouster", "robosense"):
             message = _ouster if vendor == "ouster" else _robosense
             parts.append([message(topic, one, encoding) for one in own])
@@ -192,13 +147,13 @@ def _four_messages(sent: Sequence[_Datagram], container: str) -> list[Recorded]:
     return merged(*parts)
 
 
-def _ouster(topic: str, sent: _Datagram, encoding: str) -> Recorded:
+def _ouster(topic: str, sent: Datagram, encoding: str) -> Recorded:
     package = "ouster_ros" if encoding == "ros1" else "ouster_sensor_msgs"
     data = packet_message(encoding, sent.payload)
     return Recorded(topic, f"{package}/PacketMsg", sent.host_ns, data)
 
 
-def _robosense(topic: str, sent: _Datagram, encoding: str) -> Recorded:
+def _robosense(topic: str, sent: Datagram, encoding: str) -> Recorded:
     """Header, is_difop, is_frame_begin, data."""
     body = Body(encoding).header(sent.host_ns, "rslidar").put("B", sent.port == 7788, 0)
     data = body.blob(sent.payload).done()
