@@ -26,10 +26,14 @@ from mlbatch.types import Scan
 from mlbatch.writers import atomic
 from mlbatch.writers.formats import npz
 from mlbatch.writers.output_file import Bytes
+from tests.builders.run import command
 from tests.builders.sessions import FIXTURE, SMALL, Shell, Unit, recording_shell, write_session
+from tests.builders.transcripts import transcripts
 from tests.resume_storm import contents, write_recordings
 
 CAPTURE = f"{FIXTURE / 'two_lidars.pcap'} --rig {FIXTURE / 'rig.yaml'}"
+FIX = "fix/two_lidars.pcap --rig fix/rig.yaml"
+CASES = transcripts("resume", FIX=FIX)
 # From fixtures/two_lidars/SOURCE.md: a window of 10 Hz each.
 SCANS = 7
 JOURNAL = Path("out.partial/files.jsonl")
@@ -72,6 +76,30 @@ def _whole(shell: Shell, words: str = CAPTURE) -> dict[str, object]:
     return contents(Path("whole"))
 
 
+@pytest.fixture(scope="module")
+def interrupted(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with out.partial, that of an interrupted run, and whole/out."""
+    folder = tmp_path_factory.mktemp("interrupted")
+    (folder / "fix").symlink_to(FIXTURE)
+    (folder / "whole").mkdir()
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(folder)
+        assert command("convert", *FIX.split(), "-o", "whole/out").code == 0
+        _fail_at(patch, 3, KeyboardInterrupt())
+        assert command("convert", *FIX.split(), "-o", "out").code == 130
+    return folder
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_transcript(shell: Shell, interrupted: Path, tmp_path: Path, name: str) -> None:
+    shutil.copytree(interrupted, tmp_path, symlinks=True, dirs_exist_ok=True)
+    CASES[name].check(shell, tmp_path)
+    if not Path("out").exists():
+        outcome = shell(f"convert {FIX} -o out --resume")
+        assert outcome.err == "mlbatch: out: resumed after 3 scans\n"
+    assert contents(Path()) == contents(Path("whole"))
+
+
 def test_it_continues_after_the_scans_that_are_safe(
     shell: Shell, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -101,15 +129,6 @@ def test_the_head_and_slices_are_not_made_again(shell: Shell) -> None:
     outcome = shell(f"convert {words} -o out --resume")
     assert outcome.err == "mlbatch: out: resumed after 3 scans\n"
     assert contents(Path()) == whole
-
-
-def test_an_interrupt_names_resume(shell: Shell, monkeypatch: pytest.MonkeyPatch) -> None:
-    _fail_at(monkeypatch, 2, KeyboardInterrupt())
-    outcome = shell(f"convert {CAPTURE} -o out")
-    assert outcome.err == (
-        "mlbatch: error: interrupted; finished scans are kept in .partial, from where "
-        "--resume continues\n"
-    )
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
@@ -225,25 +244,6 @@ def test_an_interrupt_in_a_finalizer_is_not_lost(
     assert calls <= 3
 
 
-def test_nothing_to_resume_is_reported(shell: Shell) -> None:
-    outcome = shell(f"convert {CAPTURE} -o out --resume")
-    assert outcome.code == 0
-    assert outcome.err == "mlbatch: out: nothing to resume; started over\n"
-    assert contents(Path()) == _whole(shell)
-
-
-def test_a_complete_output_is_left_alone(shell: Shell) -> None:
-    shell(f"convert {CAPTURE} -o out")
-    before = Path("out/report.json").read_bytes()
-    outcome = shell(f"convert {CAPTURE} -o out --resume")
-    assert (outcome.code, outcome.out) == (0, "")
-    assert outcome.err == "mlbatch: out: is complete; there is nothing to resume\n"
-    assert Path("out/report.json").read_bytes() == before
-    again = shell(f"convert {CAPTURE} -o out --resume --overwrite")
-    assert again.err == "mlbatch: out: nothing to resume; started over\n"
-    assert Path("out/report.json").read_bytes() != before
-
-
 @pytest.mark.parametrize(
     ("words", "name", "fault"),
     [
@@ -275,51 +275,6 @@ def test_a_file_missing_in_a_complete_output_is_named(
         assert fault in {one["check"] for one in json.loads(verdict.out)["violations"]}
     assert shell(f"convert {CAPTURE} {words} -o out --resume --overwrite").code == 0
     assert Path("out", name).is_file()
-
-
-def test_a_file_missing_in_a_shard_is_named(shell: Shell) -> None:
-    words = f"convert {CAPTURE} --format npz --shard 1/2 -o out"
-    shell(words)
-    lost = min(Path("out").glob("0*.npz"))
-    lost.unlink()
-    refused = shell(f"{words} --resume")
-    assert (refused.code, f"found 1 missing, first {lost.name};" in refused.err) == (1, True)
-
-
-def test_without_it_a_partial_is_replaced_and_the_option_named(shell: Shell) -> None:
-    _interrupt(shell)
-    outcome = shell(f"convert {CAPTURE} -o out")
-    assert outcome.code == 0
-    assert outcome.err == (
-        "mlbatch: warning: interrupted: out.partial with 3 finished scans is discarded; "
-        "--resume would continue after them\n"
-    )
-    assert contents(Path()) == _whole(shell)
-
-
-@pytest.mark.parametrize(
-    ("words", "difference"),
-    [
-        (f"{CAPTURE} --rate 20", "rate '20' instead of 'not given'"),
-        (f"{CAPTURE} --format ply", "format 'ply' instead of 'npz'"),
-        (f"{CAPTURE} --min-range 2", "min range m '2.0' instead of '0.0'"),
-        (f"{CAPTURE} --decode crc=check", "decode 'crc=check' instead of 'not given'"),
-        (f"{CAPTURE} --fault drop:left:1%", "faults"),
-        (f"{CAPTURE} --keep-partial", "keep partial 'True' instead of 'False'"),
-    ],
-)
-def test_another_job_is_refused(shell: Shell, words: str, difference: str) -> None:
-    _interrupt(shell)
-    outcome = shell(f"convert {words} -o out --resume")
-    assert outcome.code == 2
-    # Nothing is said to be resumed before that.
-    [line] = outcome.err.splitlines()
-    assert line.startswith(
-        f"mlbatch: error: out.partial: expected the job of the interrupted run, found {difference}"
-    )
-    assert line.endswith("; give the same, or leave out --resume to start over")
-    # The right job can still be resumed.
-    assert shell(f"convert {CAPTURE} -o out --resume").err.count("resumed after 3 scans") == 1
 
 
 @pytest.mark.parametrize(
@@ -354,29 +309,6 @@ def test_a_complete_output_of_another_job_is_refused(
     assert shell(f"convert {second} {output} --resume --overwrite").err == (
         f"mlbatch: {name}: nothing to resume; started over\n"
     )
-
-
-def test_another_shard_is_refused(shell: Shell) -> None:
-    words = f"{CAPTURE} -o out --format npz --resume --shard"
-    assert shell(f"convert {words} 1/2").code == 0
-    refused = shell(f"convert {words} 2/2")
-    assert (refused.code, "found shard '2/2' instead of '1/2'" in refused.err) == (2, True)
-    assert "is complete" in shell(f"convert {words} 1/2").err
-
-
-@pytest.mark.parametrize(
-    ("first", "second", "found"),
-    [
-        ("", "--shard 1/2", "all of its scans, not those of a shard"),
-        ("--shard 1/2", "", "a shard (shard.json)"),
-    ],
-)
-def test_a_shard_is_no_whole_output(shell: Shell, first: str, second: str, found: str) -> None:
-    words = f"{CAPTURE} -o out --format npz --resume"
-    assert shell(f"convert {words} {first}").code == 0
-    refused = shell(f"convert {words} {second}")
-    assert (refused.code, f"for --resume, found {found}; " in refused.err) == (2, True)
-    assert "is complete" in shell(f"convert {words} {first}").err
 
 
 def test_copies_and_other_versions_make_the_same_output(
@@ -531,21 +463,6 @@ def test_another_rig_of_the_same_time_is_refused(
 CHANGED = "expected the bytes that the interrupted run has written, found"
 
 
-def test_a_lost_scan_is_made_again(shell: Shell) -> None:
-    whole = _whole(shell)
-    _interrupt(shell)
-    Path("out.partial/000001.npz").unlink()
-    outcome = shell(f"convert {CAPTURE} -o out --resume")
-    assert (outcome.code, outcome.err.splitlines()) == (
-        0,
-        [
-            "mlbatch: out: resumed after 3 scans",
-            f"mlbatch: out.partial/000001.npz: {CHANGED} 'No such file or directory'; made again",
-        ],
-    )
-    assert contents(Path()) == whole
-
-
 @pytest.mark.parametrize("jobs", ["", "--jobs 3"])
 @pytest.mark.parametrize(
     "words",
@@ -586,18 +503,6 @@ def test_a_changed_byte_of_a_finished_file_is_found(shell: Shell, words: str, jo
         assert Path("out", name).stat().st_mtime_ns == time_ns
 
 
-def test_begun_files_of_other_scans_are_removed(shell: Shell) -> None:
-    """What is not known to be whole is absent, also where this run gives no such scan."""
-    whole = _whole(shell)
-    _interrupt(shell)
-    Path("out.partial/000123.npz").write_bytes(b"half a scan")
-    Path("out.partial/left").mkdir()
-    Path("out.partial/left/000001.npz").write_bytes(b"half a scan")
-    assert shell(f"convert {CAPTURE} -o out --resume").code == 0
-    Path("out/left").rmdir()
-    assert contents(Path()) == whole
-
-
 @pytest.mark.parametrize("name", ["out.mcap", "out.bag", "out --format rosbag2"])
 def test_an_output_in_one_file_is_made_from_the_start(shell: Shell, name: str) -> None:
     Path("whole").mkdir()
@@ -609,22 +514,6 @@ def test_an_output_in_one_file_is_made_from_the_start(shell: Shell, name: str) -
     target = name.split()[0]
     assert outcome.err == f"mlbatch: {target}: nothing to resume; started over\n"
     assert contents(Path()) == contents(Path("whole"))
-
-
-def test_the_state_of_an_earlier_version_is_one_line(shell: Shell) -> None:
-    whole = _whole(shell)
-    Path("out.partial").mkdir()
-    Path("out.partial/000000.npz").write_bytes(b"a scan")
-    Path("out.partial.state").write_text('0123456789abcdef {"schema":"mlbatch.state/3"}\n')
-    outcome = shell(f"convert {CAPTURE} -o out --resume")
-    assert outcome.code == 0
-    assert outcome.err.splitlines() == [
-        "mlbatch: out.partial.state: expected files.jsonl in out.partial, found the state file of "
-        "an earlier version of mlbatch; it is removed, and all files are made again",
-        "mlbatch: out: nothing to resume; started over",
-    ]
-    assert not Path("out.partial.state").exists()
-    assert contents(Path()) == whole
 
 
 def _refuse(own: files.Files) -> None:
@@ -681,53 +570,12 @@ def test_an_output_that_cannot_be_opened_leaves_nothing(
     assert [path.name for path in Path().iterdir()] == ["out"]
 
 
-@pytest.mark.parametrize("text", ["", "{", "[]\n", "nonsense\n", '{"schema":"mlbatch.files/1"}\n'])
-def test_an_unreadable_list_of_files_is_ignored(shell: Shell, text: str) -> None:
-    whole = _whole(shell)
-    _interrupt(shell)
-    JOURNAL.write_text(text)
-    outcome = shell(f"convert {CAPTURE} -o out --resume")
-    assert outcome.err == "mlbatch: out: nothing to resume; started over\n"
-    assert outcome.code == 0
-    assert contents(Path()) == whole
-
-
-def _swapped(lines: list[bytes]) -> list[bytes]:
-    return [*lines[:2], lines[3], lines[2]]
-
-
-def _dropped(lines: list[bytes]) -> list[bytes]:
-    return [*lines[:2], *lines[3:]]
-
-
-def _repeated(lines: list[bytes]) -> list[bytes]:
-    return [*lines[:2], lines[1], *lines[2:]]
-
-
 def _changed(lines: list[bytes]) -> list[bytes]:
     return [*lines[:2], lines[2].replace(b"0", b"1", 1), *lines[3:]]
 
 
 def _cut_off(lines: list[bytes]) -> list[bytes]:
     return [*lines[:3], lines[3][:-7]]
-
-
-@pytest.mark.parametrize(
-    ("change", "count"),
-    [(_swapped, 3), (_dropped, 2), (_repeated, 3), (_changed, 2), (_cut_off, 2)],
-)
-def test_files_without_a_line_are_made_again(
-    shell: Shell, change: Callable[[list[bytes]], list[bytes]], count: int
-) -> None:
-    """Lines: the job, then a scan each; they do not depend on each other."""
-    whole = _whole(shell)
-    _interrupt(shell)
-    lines = JOURNAL.read_bytes().splitlines(keepends=True)
-    JOURNAL.write_bytes(b"".join(change(lines)))
-    for word in (f"resumed after {count} scans", "is complete"):
-        outcome = shell(f"convert {CAPTURE} -o out --resume")
-        assert (outcome.code, word in outcome.err) == (0, True)
-    assert contents(Path()) == whole
 
 
 @pytest.mark.parametrize("change", [_changed, _cut_off])
@@ -782,17 +630,6 @@ def test_no_change_of_a_byte_gives_another_output(shell: Shell) -> None:
         "mlbatch: out: nothing to resume; started over",
         "mlbatch: out: resumed after 2 scans",
     }
-
-
-def test_what_did_not_reach_the_disk_is_made_again(shell: Shell) -> None:
-    """A power cut may keep the list and lose the end of files that it names."""
-    whole = _whole(shell)
-    _interrupt(shell)
-    os.truncate("out.partial/000001.npz", 0)
-    os.truncate("out.partial/000002.npz", 4096)
-    outcome = shell(f"convert {CAPTURE} -o out --resume")
-    assert (outcome.code, outcome.err.count("others; made again")) == (0, 2)
-    assert contents(Path()) == whole
 
 
 def test_a_full_disk_names_the_remedy(shell: Shell, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -888,9 +725,3 @@ def test_a_kill_between_the_renames_of_a_replaced_folder_is_resumed(
     outcome = shell(f"convert {CAPTURE} -o out --overwrite --resume")
     assert outcome.err == f"mlbatch: out: resumed after {SCANS} scans\n"
     assert contents(Path()) == whole
-
-
-def test_a_dry_run_leaves_nothing_to_resume(shell: Shell) -> None:
-    outcome = shell(f"convert {CAPTURE} --dry-run --resume")
-    assert outcome.code == 2
-    assert "--resume: expected an output to continue, found --dry-run" in outcome.err
