@@ -19,7 +19,7 @@ from tests.builders.points import CLOUD, CUSTOM, Form, cloud_message, custom_mes
 from tests.builders.rosbag1 import write_rosbag1
 from tests.builders.rosbag2 import write_folder
 from tests.builders.sweeps import pcd, raw, write_sweeps
-from tests.builders.vendor_sessions import velodyne_payloads
+from tests.builders.vendor_sessions import lidar_payloads
 
 MS = 1_000_000
 START_NS = 1_700_000_000_000_000_000
@@ -141,7 +141,7 @@ HOUR_NS = 3600 * 10**9
 def velodyne_scans(topic: str, model: str, encoding: str, frame: str) -> list[Recorded]:
     """Raw packets of a Velodyne in scans."""
     spec = VelodyneSpec(model, hour=START_NS // HOUR_NS, start_us=START_NS % HOUR_NS / 1000)
-    payloads = velodyne_payloads(spec, SCAN_PACKETS * SCANS)
+    payloads = lidar_payloads(spec, SCAN_PACKETS * SCANS)
     found = []
     for number in range(SCANS):
         part = payloads[number * SCAN_PACKETS : (number + 1) * SCAN_PACKETS]

@@ -23,10 +23,10 @@ from mlbatch.simulate.robosense import encode as robosense
 from mlbatch.simulate.velodyne import encode as velodyne
 from tests.builders import two_lidars
 from tests.builders.captures import udp_frame, write_pcap
+from tests.builders.encoded import listed
 from tests.builders.scene import hall
 from tests.builders.seen import (
     Eye,
-    Payloads,
     Seen,
     hesai_sees,
     ouster_sees,
@@ -286,10 +286,7 @@ def _others(place: Place) -> list[tuple[int, int, bytes]]:
         step_us = 1e-3 * POSITION_STEP_NS
         times_us = np.arange(2_000, end_us, step_us, dtype=np.float64)
         sent = velodyne.position_packets(VELODYNE_SPEC, times_us)
-        rows: Payloads = [
-            (int(at), row.tobytes()) for at, row in zip(sent.host_ns, sent.payloads, strict=True)
-        ]
-        return [(at, POSITION_PORT, row) for at, row in rows]
+        return [(at, POSITION_PORT, row) for at, row in listed(sent)]
     if place is ROBOSENSE:
         times_ns = range(START_NS + 9 * NS_PER_MS, END_NS, DIFOP_STEP_NS)
         return [

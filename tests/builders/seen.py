@@ -7,7 +7,6 @@ rays meet the scene, and times are those of their packets. Nothing of a decoder 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TypeAlias
 
 import numpy as np
 
@@ -17,15 +16,13 @@ from mlbatch.simulate.hesai.angles import Beams
 from mlbatch.simulate.robosense import encode as robosense
 from mlbatch.simulate.velodyne import encode as velodyne
 from tests.builders import two_lidars
+from tests.builders.encoded import Payloads, encoded, firing_ns
 from tests.builders.scene import Scene
 
-# Receive time in ns, and payload.
-Payloads: TypeAlias = list[tuple[int, bytes]]
 # Behind a near surface every third column sees another one, as a beam does that an edge cuts.
 _EDGE_EVERY = 3
 _EDGE_M = 7.0
 _PAST_M = 1e-6
-_HOUR_NS = 3_600_000_000_000
 # Packets count the azimuth in 0.01 degrees. Half of that is its own rounding; as much again may be
 # the error of the rotor speed that the few azimuths of a packet give.
 ASIDE_PER_M = 1.75e-4
@@ -139,14 +136,8 @@ def velodyne_sees(spec: velodyne.VelodyneSpec, eye: Eye, packets: int) -> Seen:
     distance_m, bright = eye.look(origin, direction, spec.returns)
     reach_m = np.array(table.dist_m)[:, None]
     counts, level = _counted(distance_m - reach_m, bright, table.unit_m)
-    sent = velodyne.encode(spec, counts, level)
-    fires_ns = velodyne.firing_times_ns(spec, columns)
-    # What the packets say, against the true times.
-    said_us = sent.payloads[:, 1200:1204].copy().view("<u4")[:, 0].astype(np.int64)
-    first_ns = fires_ns[:: spec.columns_per_packet].min(axis=1)
-    off_ns = said_us * 1000 - round(table.stamp_after_us * 1000) - first_ns
-    off_ns = (off_ns + _HOUR_NS // 2) % _HOUR_NS - _HOUR_NS // 2
-    fires_ns += off_ns.repeat(spec.columns_per_packet)[:, None]
+    payloads = encoded(spec, counts, level)
+    fires_ns = firing_ns(spec, payloads)
     # Channel 0 is the lowest beam (docs/formats.md).
     order = np.argsort(np.array(table.elevation_deg), kind="stable")
     xyz_m = eye.points(origin, direction, np.asarray(counts * table.unit_m + reach_m))
@@ -157,7 +148,7 @@ def velodyne_sees(spec: velodyne.VelodyneSpec, eye: Eye, packets: int) -> Seen:
         level[:, order],
         xyz_m[:, order],
         table.unit_m,
-        [(int(at), row.tobytes()) for at, row in zip(sent.host_ns, sent.payloads, strict=True)],
+        payloads,
         spec.columns_per_packet,
     )
 
@@ -172,10 +163,9 @@ def hesai_sees(spec: hesai.HesaiSpec, beams: Beams, eye: Eye, packets: int) -> S
     fires = hesai.fires(spec, columns)
     counts *= fires[:, :, None]
     level *= fires[:, :, None]
-    fires_ns = hesai.firing_times_ns(spec, columns)
+    payloads = encoded(spec, counts, level)
+    fires_ns = firing_ns(spec, payloads)
     never = np.iinfo(np.int64).max
-    payloads = hesai.encode_packets(spec, counts, level)
-    receive_ns = hesai.host_times_ns(spec, packets).tolist()
     return Seen(
         np.where(fires, fires_ns, never).min(axis=1),
         fires_ns,
@@ -183,7 +173,7 @@ def hesai_sees(spec: hesai.HesaiSpec, beams: Beams, eye: Eye, packets: int) -> S
         level,
         eye.points(origin, direction, np.multiply(counts, unit_m, dtype=np.float64)),
         unit_m,
-        list(zip(receive_ns, payloads, strict=True)),
+        payloads,
         spec.groups,
     )
 

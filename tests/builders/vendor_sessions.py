@@ -9,13 +9,12 @@ from pathlib import Path
 
 import numpy as np
 
-from mlbatch.simulate.hesai import encode as hesai
 from mlbatch.simulate.hesai.angles import angles_csv
 from mlbatch.simulate.robosense import encode as robosense
-from mlbatch.simulate.velodyne import encode as velodyne
 from tests.builders import livox
 from tests.builders.bags import Body, Recorded
 from tests.builders.captures import udp_frame, write_pcap
+from tests.builders.encoded import Payloads, Spec, even
 from tests.builders.sessions import Records, Unit
 
 # 800 s past the full hour.
@@ -23,34 +22,11 @@ BEGIN_NS = 1_700_000_000 * 10**9
 BEGIN_US = 800_000_000.0
 RAW_RANGE = 2000
 LEVEL = 50
-Payloads = list[tuple[int, bytes]]
 
 
-def velodyne_payloads(spec: velodyne.VelodyneSpec, packets: int) -> Payloads:
-    """(receive time, payload) of data packets."""
-    shape = packets * spec.columns_per_packet, len(spec.table.elevation_deg), spec.returns
-    sent = velodyne.encode(spec, np.full(shape, RAW_RANGE), np.full(shape, LEVEL))
-    return listed(sent)
-
-
-def listed(sent: velodyne.Sent) -> Payloads:
-    """(receive time, payload)."""
-    rows = [payload.tobytes() for payload in sent.payloads]
-    return list(zip(sent.host_ns.tolist(), rows, strict=True))
-
-
-def hesai_payloads(spec: hesai.HesaiSpec, packets: int) -> Payloads:
-    """(receive time, payload) of point packets."""
-    shape = packets * spec.groups, spec.row.channels, spec.returns
-    levels = np.full(shape, LEVEL)
-    payloads = hesai.encode_packets(spec, np.full(shape, RAW_RANGE), levels)
-    return list(zip(hesai.host_times_ns(spec, packets).tolist(), payloads, strict=True))
-
-
-def robosense_payloads(spec: robosense.RobosenseSpec, packets: int) -> Payloads:
-    """(receive time, payload) of point packets."""
-    shape = round(packets * spec.columns_per_packet), spec.row.channels, spec.returns
-    return robosense.msop(spec, np.full(shape, RAW_RANGE), np.full(shape, LEVEL))
+def lidar_payloads(spec: Spec, packets: int) -> Payloads:
+    """(receive time, payload) of packets with points."""
+    return even(spec, packets, RAW_RANGE, LEVEL)
 
 
 def difop_payloads(spec: robosense.RobosenseSpec, count: int = 4) -> Payloads:

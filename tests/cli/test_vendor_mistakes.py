@@ -14,6 +14,7 @@ from mlbatch.simulate.robosense.encode import RobosenseSpec
 from mlbatch.simulate.velodyne.encode import VelodyneSpec, position_packets
 from mlbatch.simulate.velodyne.models import calibration_yaml
 from tests.builders.bags import Recorded
+from tests.builders.encoded import listed
 from tests.builders.livox import LivoxSpec
 from tests.builders.others import EE, filled
 from tests.builders.points import CLOUD, OUSTER, cloud_message
@@ -26,14 +27,11 @@ from tests.builders.vendor_sessions import (
     difop_payloads,
     framed,
     hesai_csv,
-    hesai_payloads,
-    listed,
+    lidar_payloads,
     livox_payloads,
     ouster,
     robosense_csv,
-    robosense_payloads,
     rslidar_messages,
-    velodyne_payloads,
     write_capture,
     write_rig,
 )
@@ -106,18 +104,18 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def _write_velodyne(folder: Path) -> None:
-    few = velodyne_payloads(VLP16, FEW)
-    many = velodyne_payloads(VLP16, MANY)
+    few = lidar_payloads(VLP16, FEW)
+    many = lidar_payloads(VLP16, MANY)
     write_capture(folder / "vlp16", framed(many, IP, PORT))
     for name, model in (("vlp32c", "VLP-32C"), ("hdl64", "HDL-64E S3")):
-        payloads = velodyne_payloads(replace(VLP16, model=model), FEW)
+        payloads = lidar_payloads(replace(VLP16, model=model), FEW)
         write_capture(folder / name, framed(payloads, IP, PORT))
     positions = listed(position_packets(VLP16, np.arange(0.0, 4e5, 1e5, dtype=np.float64)))
     write_capture(folder / "positions", framed(positions, IP, 8308))
     alike = [(host_ns, payload + bytes(6)) for host_ns, payload in few]
     write_capture(folder / "alike", framed(alike, IP, PORT))
     dual = replace(VLP16, mode="dual", start_us=BEGIN_US + 532_000)
-    changed = many + velodyne_payloads(dual, MANY)
+    changed = many + lidar_payloads(dual, MANY)
     write_capture(folder / "changed", framed(changed, IP, PORT))
     (folder / "files").mkdir()
     for name, model in (("vlp16", "VLP-16"), ("vlp32c", "VLP-32C"), ("hdl32e", "HDL-32E")):
@@ -127,21 +125,21 @@ def _write_velodyne(folder: Path) -> None:
 
 
 def _write_velodyne_sessions(folder: Path) -> None:
-    few = velodyne_payloads(VLP16, FEW)
+    few = lidar_payloads(VLP16, FEW)
     behind_us = 20 * 60_000_000
     late = replace(VLP16, start_us=BEGIN_US + behind_us, host_ahead_ns=-behind_us * 1000)
-    other = framed(velodyne_payloads(late, FEW), OTHER_IP, PORT)
+    other = framed(lidar_payloads(late, FEW), OTHER_IP, PORT)
     write_capture(folder / "apart", framed(few, IP, PORT), other)
     write_capture(folder / "twins", framed(few, IP, PORT), framed(few, OTHER_IP, PORT))
     write_capture(folder / "pair", framed(few, IP, PORT), ouster().records)
-    silent = velodyne_payloads(replace(VLP16, start_us=BEGIN_US + 12e6), FEW)
+    silent = lidar_payloads(replace(VLP16, start_us=BEGIN_US + 12e6), FEW)
     write_capture(folder / "silent", ouster(125).records, framed(silent, IP, PORT))
     for name in ("pair", "silent"):
         write_metadata(folder / name / "111.json", ouster().spec)
 
 
 def _write_hesai(folder: Path) -> None:
-    few = hesai_payloads(XT16, FEW)
+    few = lidar_payloads(XT16, FEW)
     for name in ("bare", "other", "alike", "broken"):
         write_capture(folder / f"xt16_{name}", framed(few, IP, PORT))
     hesai_csv(folder / "xt16_other" / "32.csv", 32)
@@ -152,30 +150,30 @@ def _write_hesai(folder: Path) -> None:
     write_capture(folder / "xt16_twins", framed(few, IP, PORT), framed(few, OTHER_IP, PORT))
     hesai_csv(folder / "xt16_twins" / "16.csv", 16)
     hesai_csv(folder / "files" / "xt16.csv", 16)
-    write_capture(folder / "qt64", framed(hesai_payloads(QT64, FEW), IP, PORT))
+    write_capture(folder / "qt64", framed(lidar_payloads(QT64, FEW), IP, PORT))
     (folder / "files" / "p64.csv").write_bytes(angles_csv(*fan("Pandar64", 64)))
     gps = filled(512, {0: EE + b"712190403180", 18: b"$GPRMC"})
     write_capture(folder / "gps", framed([(BEGIN_NS, gps)], IP, 10110))
-    many = hesai_payloads(XT16, MANY)
-    dual = hesai_payloads(replace(XT16, mode=DUAL, start_ns=BEGIN_NS + 160_000_000), MANY)
+    many = lidar_payloads(XT16, MANY)
+    dual = lidar_payloads(replace(XT16, mode=DUAL, start_ns=BEGIN_NS + 160_000_000), MANY)
     write_capture(folder / "xt16_changed", framed(many + dual, IP, PORT))
     hesai_csv(folder / "xt16_changed" / "16.csv", 16)
-    later = hesai_payloads(replace(P40, start_ns=BEGIN_NS + 240_000_000), MANY)
+    later = lidar_payloads(replace(P40, start_ns=BEGIN_NS + 240_000_000), MANY)
     counted = [
         (host_ns, payload + number.to_bytes(4, "little"))
         for number, (host_ns, payload) in enumerate(later)
     ]
-    write_capture(folder / "p40", framed(hesai_payloads(P40, MANY) + counted, IP, PORT))
+    write_capture(folder / "p40", framed(lidar_payloads(P40, MANY) + counted, IP, PORT))
     hesai_csv(folder / "p40" / "40.csv", 40, lowest_deg=-25.0)
 
 
 def _write_robosense(folder: Path) -> None:
-    many = robosense_payloads(HELIOS, MANY)
+    many = lidar_payloads(HELIOS, MANY)
     device = difop_payloads(HELIOS)
     write_capture(folder / "helios_bare", framed(many[:FEW], IP, RS_PORT))
     write_capture(folder / "helios", framed(many, IP, RS_PORT), framed(device, IP, DIFOP_PORT))
     write_capture(folder / "difop", framed(device, IP, DIFOP_PORT))
-    write_capture(folder / "bpearl", framed(robosense_payloads(BPEARL, FEW), IP, RS_PORT))
+    write_capture(folder / "bpearl", framed(lidar_payloads(BPEARL, FEW), IP, RS_PORT))
     other = "".join(f"{15 - n * 40 / 31:.3f},0\n" for n in range(32))
     (folder / "files" / "rs32_other.csv").write_text(other, encoding="utf-8")
     robosense_csv(folder / "files" / "rs15.csv", 15)
@@ -201,7 +199,7 @@ def _write_others(folder: Path) -> None:
         for number in range(5)
     ]
     write_rosbag2(folder / "clouds.db3", clouds)
-    raw = rslidar_messages(robosense_payloads(HELIOS, MANY) + difop_payloads(HELIOS))
+    raw = rslidar_messages(lidar_payloads(HELIOS, MANY) + difop_payloads(HELIOS))
     write_rosbag2(folder / "both.db3", raw + clouds)
 
 

@@ -20,7 +20,6 @@ from mlbatch.discovery.discover import SensorSelection
 from mlbatch.pipeline.job import Job
 from mlbatch.simulate.hesai import encode as hesai
 from mlbatch.simulate.hesai import models as hesai_models
-from mlbatch.simulate.hesai.angles import Angles, Beams, MirrorAngles, angles_csv, fan
 from mlbatch.simulate.robosense import encode as robosense
 from mlbatch.simulate.robosense import models as robosense_models
 from mlbatch.simulate.velodyne import encode as velodyne
@@ -28,12 +27,12 @@ from mlbatch.simulate.velodyne.models import MODELS as VELODYNES
 from mlbatch.simulate.velodyne.models import calibration_yaml
 from mlbatch.types import Scan
 from tests.builders.captures import udp_frame, write_pcap
+from tests.builders.encoded import Payloads, hesai_unit
 from tests.builders.run import Result, in_memory
 from tests.builders.scene import hall
 from tests.builders.seen import (
     ASIDE_PER_M,
     Eye,
-    Payloads,
     Seen,
     hesai_sees,
     pose,
@@ -95,16 +94,7 @@ def hesai_sent(model: str, mode: str, operation: str = hesai_models.HIGH) -> Sen
     """mode: byte of the return mode; operation: of models with protocol 1.4."""
     # All columns of an AT128 lie within the field of one mirror.
     spec = hesai.HesaiSpec(model, int(mode, 16), start_deg=351.3, operation=operation)
-    channels = spec.row.channels
-    elevation, azimuth = fan(model, channels)
-    beams: Beams = Angles(elevation, azimuth)
-    file = "unit.csv"
-    content = angles_csv(elevation, azimuth)
-    if model == "AT128":
-        mirrors = MirrorAngles((20.0, 140.0, 260.0), elevation, azimuth)
-        beams = mirrors
-        file = "unit.dat"
-        content = mirrors.dat()
+    beams, file, content = hesai_unit(model, spec.row.channels)
     sight = hesai_sees(spec, beams, EYE, PACKETS)
     types: tuple[int, ...] = {"33": (0,), "37": (1,), "38": (2,)}.get(mode, ())
     if model == "JT16":  # Nothing in its packets identifies it.

@@ -26,10 +26,11 @@ from mlbatch.simulate.robosense.encode import (
     origins,
 )
 from tests.builders.bags import Recorded
+from tests.builders.encoded import Payloads
 from tests.builders.rosbag2 import Form, write_rosbag2
 from tests.builders.run import in_memory
 from tests.builders.sessions_of_bags import write_mcap
-from tests.builders.vendor_sessions import Payloads, robosense_scan
+from tests.builders.vendor_sessions import robosense_scan
 
 UNIT = RobosenseSpec("Helios 32, early type", start_deg=17.3)
 MESSAGES = 5

@@ -21,12 +21,12 @@ from mlbatch.lidar.interface import Calibration, ModelFile
 from mlbatch.sensors import parse_calibration
 from mlbatch.simulate.hesai import encode as hesai
 from mlbatch.simulate.hesai import models as hesai_models
-from mlbatch.simulate.hesai.angles import MirrorAngles, angles_csv, fan
 from mlbatch.simulate.robosense import encode as robosense
 from mlbatch.simulate.robosense import models as robosense_models
 from mlbatch.simulate.velodyne import encode as velodyne
 from mlbatch.simulate.velodyne.models import MODELS as VELODYNES
 from mlbatch.simulate.velodyne.models import calibration_yaml
+from tests.builders.encoded import Payloads, Spec, even, hesai_unit
 from tests.builders.loss import Came
 from tests.fuzz.decoding import sampled
 from tests.fuzz.framing import Part
@@ -50,14 +50,16 @@ class Spoken:
     model: str | None = None
 
 
+def _silent(spec: Spec, length_ns: int, per_packet_ns: float) -> Payloads:
+    """Packets that show nothing, in pairs: two returns of 128 lines take a column and a half."""
+    return even(spec, int(length_ns / per_packet_ns) // 2 * 2, 0, 0)
+
+
 def velodynes(model: str, mode: str, dark: str) -> Spoken:
     """No packet bears a count."""
     spec = velodyne.VelodyneSpec(model, mode, start_us=3e9, blind_deg=DARK_DEG[dark])
-    per_packet = spec.columns_per_packet
-    count = int((DARK_NS if dark else LENGTH_NS) / (spec.row_us * spec.rows_per_packet * 1000))
-    nothing = np.zeros((count * per_packet, len(spec.table.elevation_deg), spec.returns), np.int64)
-    sent = velodyne.encode(spec, nothing, nothing)
-    rows = [(int(at), row.tobytes()) for at, row in zip(sent.host_ns, sent.payloads, strict=True)]
+    length_ns = DARK_NS if dark else LENGTH_NS
+    rows = _silent(spec, length_ns, spec.row_us * spec.rows_per_packet * 1000)
     if not model.startswith("HDL-64E"):
         return Spoken(rows)
     return Spoken(rows, (), "unit.yaml", calibration_yaml(model).encode(), model)
@@ -68,31 +70,17 @@ def hesais(model: str, mode: str, flags: str) -> Spoken:
     row = hesai_models.MODELS[model]
     without = row.flags & ~hesai_models.SEQUENCE
     spec = hesai.HesaiSpec(model, int(mode, 16), flags=row.flags if flags else without)
-    count = int(LENGTH_NS / (spec.row.step_ns * spec.groups))
-    nothing = np.zeros((count * spec.groups, row.channels, spec.returns), np.int64)
-    rows = zip(
-        hesai.host_times_ns(spec, count).tolist(),
-        hesai.encode_packets(spec, nothing),
-        strict=True,
-    )
-    elevation, azimuth = fan(model, row.channels)
-    if model == "AT128":
-        mirrors = MirrorAngles((20.0, 140.0, 260.0), elevation, azimuth)
-        return Spoken(list(rows), (), "unit.dat", mirrors.dat())
-    return Spoken(list(rows), (), "unit.csv", angles_csv(elevation, azimuth))
+    _, file, content = hesai_unit(model, row.channels)
+    rows = _silent(spec, LENGTH_NS, float(spec.row.step_ns * spec.groups))
+    return Spoken(rows, (), file, content)
 
 
 def robosenses(model: str, mode: str, dark: str) -> Spoken:
-    """Two returns of 128 lines: packets of a column and a half."""
+    """A dark sector is the rest of the field of view."""
     sector = DARK_DEG[dark]
     view = (0.0, 360.0) if sector is None else sector[::-1]
     spec = robosense.RobosenseSpec(model, mode, view_deg=view)
-    count = (
-        int((DARK_NS if dark else LENGTH_NS) / (spec.round_ns * spec.columns_per_packet)) // 2 * 2
-    )
-    columns = round(count * spec.columns_per_packet)
-    nothing = np.zeros((columns, spec.row.channels, spec.returns), np.int64)
-    rows = robosense.msop(spec, nothing, nothing)
+    rows = _silent(spec, DARK_NS if dark else LENGTH_NS, spec.round_ns * spec.columns_per_packet)
     return Spoken(rows, [(rows[0][0] + 1, robosense.difop(spec, robosense.fan(spec)))])
 
 

@@ -16,6 +16,7 @@ from mlbatch.pipeline.job import Job
 from mlbatch.simulate.hesai import encode as hesai
 from mlbatch.simulate.hesai.angles import angles_csv
 from mlbatch.simulate.velodyne import encode as velodyne
+from tests.builders.encoded import Spec, encoded, shape
 from tests.builders.run import Values, buffers_of, in_memory, prints
 from tests.golden.vendor_messages import CONTAINERS, NS_PER_MS, Unit, unit_of
 
@@ -29,21 +30,18 @@ def pair() -> tuple[Unit, Unit]:
     xt16 = hesai.HesaiSpec("PandarXT-16", hesai.DUAL, start_deg=351.3)
     # The same second, as so many microseconds past its hour.
     vlp16 = velodyne.VelodyneSpec("VLP-16", "dual", start_azimuth_deg=93.0, start_us=800_000_417.0)
-    columns = 4 * (LENGTH_NS // 200_000), 12 * (LENGTH_NS // 663_552)
-    readings = []
-    for count in columns:
-        counts = rng.integers(0, 20_000, (count, 16, 2))
+    lidars: list[tuple[str, Spec, int]] = [
+        ("hesai", xt16, 200_000),
+        ("velodyne", vlp16, 663_552),
+    ]
+    units = []
+    for vendor, spec, packet_ns in lidars:
+        size = shape(spec, LENGTH_NS // packet_ns)
+        counts = rng.integers(0, 20_000, size)
         # Many single returns, sent twice.
-        counts[..., 1] = np.where(rng.random(counts.shape[:2]) < 0.6, *np.moveaxis(counts, 2, 0))
-        readings.append((counts, rng.integers(0, 256, counts.shape)))
-    payloads = hesai.encode_packets(xt16, *readings[0])
-    host_ns = hesai.host_times_ns(xt16, len(payloads)).tolist()
-    sent = velodyne.encode(vlp16, *readings[1])
-    turning = zip(sent.host_ns.tolist(), (row.tobytes() for row in sent.payloads), strict=True)
-    return (
-        unit_of("hesai", tuple(zip(host_ns, payloads, strict=True))),
-        unit_of("velodyne", tuple(turning)),
-    )
+        counts[..., 1] = np.where(rng.random(size[:2]) < 0.6, *np.moveaxis(counts, 2, 0))
+        units.append(unit_of(vendor, tuple(encoded(spec, counts, rng.integers(0, 256, size)))))
+    return units[0], units[1]
 
 
 def angles(folder: Path) -> Path:

@@ -19,6 +19,7 @@ from mlbatch.simulate.hesai.angles import angles_csv
 from mlbatch.simulate.ouster.encode import OusterSpec, encode_packets, metadata_json
 from mlbatch.simulate.robosense import encode as robosense
 from mlbatch.simulate.velodyne import encode as velodyne
+from tests.builders.encoded import Spec, encoded, firing_ns, shape
 
 NS_PER_S = 10**9
 NS_PER_MS = 10**6
@@ -116,23 +117,21 @@ def ouster(spell: Spell) -> Sent:
     return _sent("ouster", spell, payloads, stamps, ranges)
 
 
+def _spun(vendor: str, spell: Spell, seed: int, spec: Spec, per_packet_ns: float) -> Sent:
+    """A spinning lidar of 16 channels and one return."""
+    ranges, levels = _readings(seed, *shape(spec, int(spell.length_ns / per_packet_ns)))
+    payloads = encoded(spec, ranges, levels)
+    stamps = firing_ns(spec, payloads).min(axis=1)
+    return _sent(vendor, spell, [data for _, data in payloads], stamps, ranges)
+
+
 def velodyne_vlp16(spell: Spell) -> Sent:
     """754 packets a second of 24 columns; no count of packets."""
     hour, past_ns = divmod(spell.begin_ns, HOUR_NS)
-    spec = velodyne.VelodyneSpec("VLP-16", start_azimuth_deg=93.0, start_us=past_ns / 1000)
-    spec = replace(spec, hour=hour)
-    packets = int(spell.length_ns / (spec.row_us * spec.rows_per_packet * 1000))
-    columns = np.arange(packets * spec.columns_per_packet)
-    ranges, levels = _readings(2, len(columns), 16, 1)
-    sent = velodyne.encode(spec, ranges, levels)
-    true_ns = velodyne.firing_times_ns(spec, columns).min(axis=1)
-    # Packets contain the time of their first firing, in whole us.
-    first_ns = true_ns[:: spec.columns_per_packet]
-    said_ns = sent.payloads[:, 1200:1204].copy().view("<u4")[:, 0].astype(np.int64) * 1000
-    off_ns = (said_ns - first_ns % HOUR_NS + HOUR_NS // 2) % HOUR_NS - HOUR_NS // 2
-    stamps = true_ns + off_ns.repeat(spec.columns_per_packet)
-    payloads = [row.tobytes() for row in sent.payloads]
-    return _sent("velodyne", spell, payloads, stamps, ranges)
+    spec = velodyne.VelodyneSpec(
+        "VLP-16", start_azimuth_deg=93.0, start_us=past_ns / 1000, hour=hour
+    )
+    return _spun("velodyne", spell, 2, spec, spec.row_us * spec.rows_per_packet * 1000)
 
 
 def hesai_xt16(spell: Spell) -> Sent:
@@ -140,11 +139,7 @@ def hesai_xt16(spell: Spell) -> Sent:
     spec = hesai.HesaiSpec(
         "PandarXT-16", start_deg=351.3, start_ns=spell.begin_ns, sequence=spell.count
     )
-    packets = int(spell.length_ns / (spec.row.step_ns * spec.groups))
-    ranges, levels = _readings(3, packets * spec.groups, 16, 1)
-    payloads = hesai.encode_packets(spec, ranges, levels)
-    stamps = hesai.firing_times_ns(spec, packets * spec.groups).min(axis=1)
-    return _sent("hesai", spell, payloads, stamps, ranges)
+    return _spun("hesai", spell, 3, spec, float(spec.row.step_ns * spec.groups))
 
 
 def robosense_helios16(spell: Spell) -> Sent:
@@ -152,13 +147,7 @@ def robosense_helios16(spell: Spell) -> Sent:
     spec = robosense.RobosenseSpec(
         "Helios 16", start_deg=301.66, start_ns=spell.begin_ns, first_counter=spell.count
     )
-    per_packet = int(spec.columns_per_packet)
-    packets = spell.length_ns // (spec.round_ns * per_packet)
-    ranges, levels = _readings(4, packets * per_packet, 16, 1)
-    payloads = [payload for _, payload in robosense.msop(spec, ranges, levels)]
-    columns = np.arange(packets * per_packet)
-    stamps = robosense.firing_times_ns(spec, columns).min(axis=1)
-    return _sent("robosense", spell, payloads, stamps, ranges)
+    return _spun("robosense", spell, 4, spec, spec.round_ns * spec.columns_per_packet)
 
 
 @dataclass(frozen=True, slots=True)

@@ -30,7 +30,7 @@ from tests.builders.sessions import (
     write_metadata,
     write_session,
 )
-from tests.builders.vendor_sessions import framed, velodyne_payloads, write_capture
+from tests.builders.vendor_sessions import framed, lidar_payloads, write_capture
 
 CAPTURE = FIXTURE / "two_lidars.pcap"
 OUSTER = RECORDINGS / "ouster"
@@ -394,7 +394,7 @@ def test_the_whole_of_a_short_recording_is_its_first_seconds(shell: Shell) -> No
 def test_loss_is_that_of_a_conversion(shell: Shell, tmp_path: Path, whole: str) -> None:
     """Also of a sensor whose packets carry no number, among duplicates and damaged timestamps."""
     spec = VelodyneSpec("VLP-16", "strongest")
-    sent = velodyne_payloads(spec, 800)
+    sent = lidar_payloads(spec, 800)
     lost = {200, 201, 500}
     kept = [one for number, one in enumerate(sent) if number not in lost]
     at_ns, payload = kept[300]
