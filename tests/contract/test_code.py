@@ -1,4 +1,4 @@
-"""Rules for every file of the package: who prints, how long it is, what is documented."""
+"""Rules of the repository that ruff (pyproject.toml) does not check."""
 
 from __future__ import annotations
 
@@ -12,8 +12,6 @@ import pytest
 from tests.contract.tree import PACKAGE, ROOT, Module, modules, plugins
 
 MODULES = modules()
-SPEAKERS = ("print", "exit", "quit", "sys.exit", "os._exit", "typer.echo", "typer.Exit")
-STREAMS = ("sys.stdout", "sys.stderr")
 # What a plug-in's docstring names: a specification, a manual, or the page of facts.
 SOURCE = re.compile(r"docs/sources/\w+\.md|RFC \d+|draft-[\w-]+|APPNOTE|Source: ")
 DOTTED = re.compile(r"`([A-Z]\w+)\.([a-z]\w*)")
@@ -23,37 +21,6 @@ Function = ast.FunctionDef | ast.AsyncFunctionDef
 
 def _by_name(module: Module) -> str:
     return module.name or "mlbatch"
-
-
-@pytest.mark.parametrize("module", MODULES, ids=_by_name)
-def test_only_the_command_line_prints_or_exits(module: Module) -> None:
-    if module.top == "cli":
-        return
-    for node in ast.walk(module.tree):
-        if isinstance(node, ast.Call | ast.Raise | ast.Attribute):
-            text = ast.unparse(node).partition("(")[0].removeprefix("raise ")
-            assert text not in (*SPEAKERS, *STREAMS), f"{module.path}:{node.lineno}: {text}"
-
-
-@pytest.mark.parametrize("module", MODULES, ids=_by_name)
-def test_no_assert_at_run_time(module: Module) -> None:
-    asserts = [node.lineno for node in ast.walk(module.tree) if isinstance(node, ast.Assert)]
-    assert not asserts
-
-
-@pytest.mark.parametrize("module", MODULES, ids=_by_name)
-def test_everything_public_is_documented(module: Module) -> None:
-    assert ast.get_docstring(module.tree), f"{module.path}: no docstring"
-    for node in _public(module.tree):
-        assert ast.get_docstring(node), f"{module.path}:{node.lineno}: {node.name}"
-
-
-def _public(node: ast.Module | ast.ClassDef) -> Iterator[Function | ast.ClassDef]:
-    for inner in node.body:
-        if isinstance(inner, Function | ast.ClassDef) and not inner.name.startswith("_"):
-            yield inner
-            if isinstance(inner, ast.ClassDef):
-                yield from _public(inner)
 
 
 def test_comments_name_attributes_that_are_there() -> None:

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Iterator
 
-import pytest
-
-from tests.contract.tree import PACKAGE, ROOT, Module, imports, modules, plugins
+from tests.contract.tree import PACKAGE, ROOT, Import, Module, imports, modules, plugins
 
 # From top to bottom: a package imports from its own modules and from lower floors.
 FLOORS: tuple[tuple[str, ...], ...] = (
@@ -36,6 +35,12 @@ MODULES = modules()
 NAMES = frozenset(module.name for module in MODULES)
 
 
+def _imports() -> Iterator[tuple[Module, Import]]:
+    for module in MODULES:
+        for found in imports(module, NAMES):
+            yield module, found
+
+
 def test_every_package_has_its_floor() -> None:
     assert {module.top for module in MODULES} <= set(FLOOR)
 
@@ -47,9 +52,8 @@ def test_the_map_draws_these_floors() -> None:
     assert floors == [set(names) - {""} for names in FLOORS[1:]]
 
 
-@pytest.mark.parametrize("module", MODULES, ids=lambda module: module.name or "mlbatch")
-def test_imports_go_down(module: Module) -> None:
-    for found in imports(module, NAMES):
+def test_imports_go_down() -> None:
+    for module, found in _imports():
         top = found.target.partition(".")[0]
         if module.name == "":
             assert found.only_for_types, f"{module.path}:{found.line}: the root must load nothing"
@@ -91,17 +95,15 @@ def test_verify_knows_nothing_of_the_writers() -> None:
     assert not [name for name in reached if name.partition(".")[0] in ("writers", "pipeline")]
 
 
-@pytest.mark.parametrize("module", MODULES, ids=lambda module: module.name or "mlbatch")
-def test_nobody_names_a_plugin(module: Module) -> None:
+def test_nobody_names_a_plugin() -> None:
     found_by_name = {plugin.name for plugin in plugins()}
-    for found in imports(module, NAMES):
+    for module, found in _imports():
         assert found.target not in found_by_name, f"{module.path}:{found.line}: {found.target}"
 
 
-@pytest.mark.parametrize("module", MODULES, ids=lambda module: module.name or "mlbatch")
-def test_vendors_know_nothing_of_each_other(module: Module) -> None:
+def test_vendors_know_nothing_of_each_other() -> None:
     """Modules of a vendor's folder are imported by that folder and the vendor's simulator alone."""
-    for found in imports(module, NAMES):
+    for module, found in _imports():
         vendor = VENDOR.match(found.target)
         if vendor is not None:
             folders = vendor[0], f"simulate.{vendor[1]}."
