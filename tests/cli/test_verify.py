@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from mlbatch.cli.verify import SHOWN
+from mlbatch.outputs.file_formats import FILE_FORMATS
 from mlbatch.verification import CHECKS
 from tests.builders.run import ROOT, command
 from tests.builders.verify_outputs import Arrays, arrays, copied, made, npz, plus
@@ -82,5 +84,17 @@ def test_the_page_names_every_check() -> None:
     page = (ROOT / "docs" / "verify.md").read_text(encoding="utf-8")
     rows = [line.split("|")[1] for line in page.splitlines() if line.startswith("| `")]
     named = [name.strip(" `") for row in rows for name in row.split(",")]
-    assert named[: len(CHECKS)] == list(CHECKS)
-    assert set(named[len(CHECKS) :]) == set(CHECKS)
+    assert named == list(CHECKS)
+
+
+def test_the_page_names_the_limits_of_each_format() -> None:
+    page = (ROOT / "docs" / "verify.md").read_text(encoding="utf-8")
+    table = page.partition("## What is checkable in each format")[2]
+    rows = re.findall(r"^\| (.+?) \| (.+) \|$", table, re.MULTILINE)
+    of_row = {name: set(re.findall(r"`(\w+)`", text)) for name, text in rows}
+    for form in FILE_FORMATS:
+        (named,) = (of_row[row] for row in of_row if form.name in row.lower())
+        # A row below that of npz adds to the rows before.
+        if form.name != "npz":
+            named = named | of_row["npz"] | of_row["PLY, PCD, LAS, LAZ"]
+        assert set(form.limits) <= named, form.name
