@@ -31,7 +31,6 @@ from tests.bench.results import (
     Row,
     Run,
     Workload,
-    aligned,
     changes,
     document,
     lines,
@@ -79,58 +78,62 @@ def result(*rows: Row) -> Result:
 # -- comparisons ----------------------------------------------------------------------------------
 
 
-def compared(*rows: Row) -> dict[tuple[str, str, str], tuple[float, ...]]:
-    """Ratios by program, the other program, and the figure."""
-    return {(one.program, one.to, one.of): one.values for one in ratios(rows)}
+OTHER = replace(READ, read_bytes=5_000_000)
+PLAIN = row("numpy", [run(1.0, 0.6)])
+DRY = row(DRY_RUN, [run(1.0, 0.6)])
+WRITES = row("mcap", [run(2.0, 1.0, wall_s=3.0, workload=WRITTEN)], base=DRY_RUN)
 
 
-def test_runs_are_compared_in_pairs() -> None:
-    ours = row("numpy", [run(1.0, 0.5), run(3.0, 2.0)])
-    theirs = row("sdk", [run(2.0, 2.0), run(3.0, 1.0)], PEER)
-    assert compared(ours, theirs) == {
-        ("numpy", "sdk", CPU): (0.5, 1.0),
-        ("numpy", "sdk", OWN_CPU): (0.25, 2.0),
-    }
-
-
-def test_a_peer_on_another_recording_is_not_compared() -> None:
-    other = replace(READ, read_bytes=5_000_000)
-    ours = row("numpy, fragments", [run(1.0, workload=other)], base="numpy")
-    assert compared(ours, row("sdk", [run(2.0)], PEER)) == {}
-
-
-def test_a_program_is_compared_with_its_base() -> None:
-    plain = row("numpy", [run(2.0, wall_s=4.0)])
-    fragments = row("numpy, fragments", [run(2.5, wall_s=4.0)], base="numpy")
-    assert compared(plain, fragments) == {
-        ("numpy, fragments", "numpy", CPU): (1.25,),
-        ("numpy, fragments", "numpy", WALL): (1.0,),
-    }
-
-
-def test_floors_of_a_dry_run() -> None:
-    ours = row("numpy", [run(1.0, 0.6)])
-    copied = row(COPY, [run(9.0, 0.1, workload=FLOORED)], FLOOR)
-    started = row(START, [run(9.0, 0.1, workload=FLOORED)], FLOOR)
-    values = compared(ours, copied, started)
-    assert values == {
-        ("numpy", COPY, OWN_CPU): (pytest.approx(6.0),),
-        ("numpy", START, MEMORY): (1.0,),
-    }
-
-
-def test_floors_of_an_output() -> None:
-    dry = row(DRY_RUN, [run(1.0, 0.6)])
-    ours = row("mcap", [run(2.0, 1.0, wall_s=3.0, workload=WRITTEN)], base=DRY_RUN)
-    written = row(WRITE, [run(9.0, 0.1, wall_s=2.0, workload=FLOORED)], FLOOR)
-    library = row(LIBRARY, [run(9.0, 1.6, workload=FLOORED)], FLOOR)
-    assert compared(dry, ours, written, library) == {
-        ("mcap", DRY_RUN, CPU): (2.0,),
-        ("mcap", DRY_RUN, WALL): (1.5,),
-        ("mcap", WRITE, WALL): (1.5,),
-        # (1.0 - 0.6) s of 1.6 s.
-        ("mcap", LIBRARY, WRITING): (pytest.approx(0.25),),
-    }
+@pytest.mark.parametrize(
+    ("rows", "expected"),
+    [
+        pytest.param(
+            [
+                row("numpy", [run(1.0, 0.5), run(3.0, 2.0)]),
+                row("sdk", [run(2.0, 2.0), run(3.0, 1.0)], PEER),
+            ],
+            {("numpy", "sdk", CPU): (0.5, 1.0), ("numpy", "sdk", OWN_CPU): (0.25, 2.0)},
+            id="runs in pairs",
+        ),
+        pytest.param(
+            [row("numpy", [run(1.0, workload=OTHER)]), row("sdk", [run(2.0)], PEER)],
+            {},
+            id="a peer on another recording",
+        ),
+        pytest.param(
+            [PLAIN, row("fragments", [run(1.25, wall_s=2.0)], base="numpy")],
+            {("fragments", "numpy", CPU): (1.25,), ("fragments", "numpy", WALL): (1.0,)},
+            id="a base",
+        ),
+        pytest.param(
+            [
+                PLAIN,
+                row(COPY, [run(9.0, 0.1, workload=FLOORED)], FLOOR),
+                row(START, [run(9.0, 0.1, workload=FLOORED)], FLOOR),
+            ],
+            {("numpy", COPY, OWN_CPU): pytest.approx((6.0,)), ("numpy", START, MEMORY): (1.0,)},
+            id="floors of a dry run",
+        ),
+        pytest.param(
+            [
+                DRY,
+                WRITES,
+                row(WRITE, [run(9.0, 0.1, wall_s=2.0, workload=FLOORED)], FLOOR),
+                row(LIBRARY, [run(9.0, 1.6, workload=FLOORED)], FLOOR),
+            ],
+            {
+                ("mcap", DRY_RUN, CPU): (2.0,),
+                ("mcap", DRY_RUN, WALL): (1.5,),
+                ("mcap", WRITE, WALL): (1.5,),
+                # (1.0 - 0.6) s of 1.6 s.
+                ("mcap", LIBRARY, WRITING): pytest.approx((0.25,)),
+            },
+            id="floors of an output",
+        ),
+    ],
+)
+def test_comparisons(rows: list[Row], expected: dict[tuple[str, str, str], object]) -> None:
+    assert {(one.program, one.to, one.of): one.values for one in ratios(rows)} == expected
 
 
 def test_changes_are_ratios_of_medians() -> None:
@@ -145,43 +148,30 @@ def test_changes_are_ratios_of_medians() -> None:
 
 # -- document -------------------------------------------------------------------------------------
 
-KEYS = ["schema", "date", "machine", "seconds", "repeat"]
-LISTS = ["rows", "ratios", "changes", "notes", "failed"]
 
-
-def test_the_document_contains_every_run() -> None:
-    rows = row("numpy", [run(1.0, stages_s=STAGES), run(2.0)])
-    found = json.loads(json.dumps(document(result(rows))))
-    assert list(found) == [*KEYS, *LISTS]
-    assert found["schema"] == "mlbatch.bench/1"
-    assert found["machine"]["cpu"] == "Abacus"
+def test_a_document_holds_every_run_and_is_read_back(tmp_path: Path) -> None:
+    made = replace(
+        result(row("numpy", [run(1.0, stages_s=STAGES), run(2.0)])),
+        ratios=(Ratio("dual-4", "numpy", "sdk", CPU, (0.5, 0.75)),),
+        changes=(Change("dual-4", "numpy", CPU, 4.0, 1.0),),
+    )
+    path = tmp_path / "old.json"
+    path.write_text(json.dumps(document(made)))
+    found = json.loads(path.read_text())
+    head = ["schema", "date", "machine", "seconds", "repeat"]
+    assert list(found) == [*head, "rows", "ratios", "changes", "notes", "failed"]
+    assert (found["schema"], found["machine"]["cpu"]) == ("mlbatch.bench/1", "Abacus")
     (only,) = found["rows"]
     assert (only["case"], only["program"], only["cpu_s"]) == ("dual-4", "numpy", [1.0, 2.0])
     assert (only["slots"], only["recorded_s"], only["read_bytes"]) == (1_000_000, 10.0, 4_000_000)
     assert only["stages_s"]["decode"] == [0.4, 0.0]
-
-
-def test_the_document_contains_ratios_and_changes() -> None:
-    found = document(
-        replace(
-            result(row("numpy", [run(1.0)])),
-            ratios=(Ratio("dual-4", "numpy", "sdk", CPU, (0.5, 0.75)),),
-            changes=(Change("dual-4", "numpy", CPU, 4.0, 1.0),),
-        )
-    )
     pair = {"case": "dual-4", "program": "numpy", "to": "sdk", "of": CPU}
-    assert found["ratios"] == [{**pair, "values": (0.5, 0.75), "median": 0.625}]
-    (change,) = json.loads(json.dumps(found["changes"]))
-    assert change["ratio"] == 0.25
-
-
-def test_an_earlier_document_is_read_back(tmp_path: Path) -> None:
-    path = tmp_path / "old.json"
-    path.write_text(json.dumps(document(result(row("numpy", [run(1.0), run(2.0)])))))
-    found = read_document(path)
-    assert list(found) == [("dual-4", "numpy")]
-    assert found["dual-4", "numpy"]["cpu_s"] == [1.0, 2.0]
-    assert found["dual-4", "numpy"]["rss_mb"] == [80.0, 80.0]
+    assert found["ratios"] == [{**pair, "values": [0.5, 0.75], "median": 0.625}]
+    assert found["changes"][0]["ratio"] == 0.25
+    figures = read_document(path)
+    assert list(figures) == [("dual-4", "numpy")]
+    assert figures["dual-4", "numpy"]["cpu_s"] == [1.0, 2.0]
+    assert figures["dual-4", "numpy"]["rss_mb"] == [80.0, 80.0]
 
 
 @pytest.mark.parametrize(
@@ -234,20 +224,12 @@ def test_a_line_has_medians_in_the_units_of_the_head() -> None:
     }
 
 
-def test_the_machine_and_the_date_come_first() -> None:
-    found = lines(result(row("numpy", [run(1.0)])))
-    assert found[0] == "Abacus, 2 cores, 1000 MB, S"
-    assert found[1] == "vector instructions: sse2 avx"
-    assert found[2] == "2026-01-02T03:04:05Z, load 0.5, mlbatch 0.1.0, python 3.11.7"
-    assert found[3].startswith("10 s of recording, medians of 3, ")
-
-
 def test_programs_without_counts_have_empty_cells() -> None:
     found = lines(result(row("start", [run(1.0, workload=Workload())])))
     assert found[6].split() == ["dual-4", "start", "1.000", "0.500", "2.000", "0.0", "80"]
 
 
-def test_ratios_changes_and_notes_follow() -> None:
+def test_machine_first_then_ratios_changes_and_notes() -> None:
     found = lines(
         replace(
             result(row("numpy", [run(1.0)])),
@@ -256,23 +238,15 @@ def test_ratios_changes_and_notes_follow() -> None:
                 Change("dual-4", "numpy", CPU, 4.0, 1.0),
                 Change("dual-4", "numpy", MEMORY, 50.0, 60.0),
             ),
-            notes=("no peers",),
+            notes=("\x1b[31mno peers",),
         )
     )
+    assert found[0] == "Abacus, 2 cores, 1000 MB, S"
+    assert found[1] == "vector instructions: sse2 avx"
+    assert found[2] == "2026-01-02T03:04:05Z, load 0.5, mlbatch 0.1.0, python 3.11.7"
+    assert found[3].startswith("10 s of recording, medians of 3, ")
     assert "dual-4  numpy    sdk  CPU   0.50   0.25  4.00" in found
     changed = next(line for line in found if "0.25 " in line and "sdk" not in line)
     assert changed.split() == ["dual-4", "numpy", "0.25", "1.20"]
-    assert found[-1] == "note: no peers"
-
-
-def test_numbers_are_aligned_to_the_right() -> None:
-    assert aligned([("a", "b"), ("long", "1"), ("x", "22")], 1) == [
-        "a      b",
-        "long   1",
-        "x     22",
-    ]
-
-
-def test_escape_sequences_are_not_printed() -> None:
-    found = lines(replace(result(row("numpy", [run(1.0)])), notes=("\x1b[31m",)))
-    assert "\x1b" not in "".join(found)
+    # No escape sequences.
+    assert found[-1] == "note: \\x1b[31mno peers"

@@ -15,6 +15,8 @@ from tests.builders import livox
 from tests.builders.bags import Body, Recorded
 from tests.builders.captures import udp_frame, write_pcap
 from tests.builders.encoded import Payloads, Spec, even
+from tests.builders.messages import Unit as Sender
+from tests.builders.messages import messages
 from tests.builders.sessions import Records, Unit
 
 # 800 s past the full hour.
@@ -65,18 +67,9 @@ def robosense_csv(path: Path, channels: int) -> None:
     path.write_text("".join(f"{n - 8}.0,0.5\n" for n in range(channels)), encoding="utf-8")
 
 
-def rslidar_message(payload: bytes) -> bytes:
-    """An rslidar_msg/RslidarPacket: header, is_difop, is_frame_begin, data."""
-    is_difop = payload.startswith(robosense.DIFOP_MAGIC)
-    return Body("cdr").header(0, "rslidar").put("B", is_difop, 0).blob(payload).done()
-
-
 def rslidar_messages(payloads: Payloads, topic: str = "/rslidar_packets") -> list[Recorded]:
     """Point and device packets on one topic, as the vendor's driver publishes them."""
-    return [
-        Recorded(topic, "rslidar_msg/RslidarPacket", host_ns, rslidar_message(payload))
-        for host_ns, payload in sorted(payloads)
-    ]
+    return messages(Sender("robosense", topic, sorted(payloads)), "cdr")
 
 
 def robosense_scan(payloads: Payloads) -> bytes:

@@ -13,16 +13,16 @@ from pathlib import Path
 import numpy as np
 
 from tests.builders import livox
-from tests.builders.bags import Body, Recorded, packet_message
+from tests.builders.bags import Recorded
 from tests.builders.captures import Packet, Section, udp_frame, write_pcap, write_pcapng
+from tests.builders.messages import Unit, merged, messages
 from tests.builders.points import OUSTER, STAMP_NS, Form, cloud_message, write_points
 from tests.builders.rosbag1 import write_rosbag1
 from tests.builders.rosbag2 import write_rosbag2
 from tests.builders.sessions_of_bags import packets_only, told, write_mcap
 from tests.builders.traffic import Datagram, datagrams_of, read_pcap
-from tests.golden.vendor_messages import Unit, merged, nebula, scans, singles
 from tests.matrix.containers import CONTAINERS as MATRIX_CONTAINERS
-from tests.matrix.containers import rig_text
+from tests.matrix.containers import SCAN_NS, rig_text
 from tests.matrix.lidars import VENDORS, Spell, write_metadata
 
 FIXTURES = Path(__file__).resolve().parents[2] / "fixtures"
@@ -52,7 +52,6 @@ NS_PER_MS = 1_000_000
 _BEGIN_NS = 1_777_881_599_500_000_000
 _SPELL = Spell(_BEGIN_NS, 240 * NS_PER_MS)
 _MATRIX_NAMES = {"bag": "rosbag1", "db3": "rosbag2"}
-_SCAN_NS = 20 * NS_PER_MS
 
 
 def write_recordings(folder: Path) -> None:
@@ -78,11 +77,11 @@ def rig_of(recording: str, container: str) -> str:
     return "rig.yaml" if container in CAPTURES else "rig_of_topics.yaml"
 
 
-def _write_bags(folder: Path, messages: Mapping[str, Sequence[Recorded]]) -> None:
-    """messages: of each container."""
-    write_mcap(folder / "drive.mcap", messages["mcap"])
-    write_rosbag1(folder / "drive.bag", messages["bag"])
-    write_rosbag2(folder / "drive.db3", messages["db3"])
+def _write_bags(folder: Path, recorded: Mapping[str, Sequence[Recorded]]) -> None:
+    """recorded: messages of each container."""
+    write_mcap(folder / "drive.mcap", recorded["mcap"])
+    write_rosbag1(folder / "drive.bag", recorded["bag"])
+    write_rosbag2(folder / "drive.db3", recorded["db3"])
 
 
 def _write_captures(folder: Path, frames: Sequence[tuple[int, bytes]]) -> None:
@@ -132,32 +131,9 @@ def _four_messages(sent: Sequence[Datagram], container: str) -> list[Recorded]:
     parts = []
     for vendor, (source_ip, ports, topic) in _FOUR.items():
         own = [one for one in sent if one.source == source_ip and one.port in ports]
-        if vendor in ("ouster", "robosense"):
-            message = _ouster if vendor == "ouster" else _robosense
-            parts.append([message(topic, one, encoding) for one in own])
-            continue
-        packets = tuple((one.host_ns, one.payload) for one in own)
-        unit = Unit(vendor, source_ip, topic, packets)
-        if container == "mcap":
-            parts.append(nebula(unit))
-        elif container == "bag":
-            parts.append(singles(unit, encoding))
-        else:
-            parts.append(scans(unit, encoding, _SCAN_NS))
+        unit = Unit(vendor, topic, [(one.host_ns, one.payload) for one in own])
+        parts.append(messages(unit, encoding, SCAN_NS if container == "db3" else 0))
     return merged(*parts)
-
-
-def _ouster(topic: str, sent: Datagram, encoding: str) -> Recorded:
-    package = "ouster_ros" if encoding == "ros1" else "ouster_sensor_msgs"
-    data = packet_message(encoding, sent.payload)
-    return Recorded(topic, f"{package}/PacketMsg", sent.host_ns, data)
-
-
-def _robosense(topic: str, sent: Datagram, encoding: str) -> Recorded:
-    """Header, is_difop, is_frame_begin, data."""
-    body = Body(encoding).header(sent.host_ns, "rslidar").put("B", sent.port == 7788, 0)
-    data = body.blob(sent.payload).done()
-    return Recorded(topic, "rslidar_msg/RslidarPacket", sent.host_ns, data)
 
 
 def _vendor(folder: Path, vendor: str) -> None:
@@ -199,12 +175,12 @@ def _clouds(folder: Path) -> None:
             for column in range(64)
         ]
         revolutions.append(points)
-    messages = {}
+    recorded = {}
     for container in BAGS:
         form = Form("ros1" if container == "bag" else "cdr")
         data = [
             cloud_message(OUSTER, points, STAMP_NS + number * 100 * NS_PER_MS, form)
             for number, points in enumerate(revolutions)
         ]
-        messages[container] = write_points("/roof/points", data)
-    _write_bags(folder, messages)
+        recorded[container] = write_points("/roof/points", data)
+    _write_bags(folder, recorded)

@@ -6,11 +6,14 @@ import gzip
 import re
 from collections import Counter
 from dataclasses import replace
+from fractions import Fraction
 from pathlib import Path
 
 import pytest
 
+from mlbatch.discovery.discover import SensorSelection
 from mlbatch.frames.naming import NAMINGS
+from mlbatch.pipeline.job import Job
 from mlbatch.readers import open_recording
 from mlbatch.readers.bag.packet_messages import PACKET_TYPES
 from mlbatch.types import StreamTable
@@ -18,6 +21,9 @@ from tests.builders.captures import Packet, Section, pcap_bytes, write_pcapng
 from tests.builders.run import FIXTURE, RECORDINGS, ROOT, Values, command, in_memory, prints
 from tests.builders.sessions_of_bags import CONTAINERS, edited_copy
 from tests.builders.traffic import read_pcap
+from tests.matrix.cells import plain
+from tests.matrix.containers import CONTAINERS as MATRIX
+from tests.matrix.lidars import write_metadata
 
 # MANIFEST.md: topic, packets, their bytes.
 BAGS = {
@@ -78,6 +84,33 @@ def rotated(path: Path, folder: Path, kind: str) -> tuple[Path, ...]:
             target.write_bytes(gzip.compress(data) if kind == "gz" else data)
         paths.append(target)
     return tuple(paths)
+
+
+@pytest.mark.parametrize(("name", "codes"), [("pcap", []), ("rosbag2", ["max_wait", "max_wait"])])
+def test_a_message_that_is_longer_than_the_wait_is_warned_of(
+    name: str, codes: list[str], tmp_path: Path
+) -> None:
+    """Messages hold the packets of 20 ms, after which 15 ms are over."""
+    session = [plain(vendor) for vendor in ("hesai", "velodyne")]
+    write_metadata(tmp_path)
+    selection = SensorSelection(metadata=(tmp_path / "unit.csv",), identity_extrinsics=True)
+    path = MATRIX[name](tmp_path, session)
+    short = Job((path,), selection, Fraction(20), keep_partial=True, max_wait_ns=15_000_000)
+    warned = [one for one in in_memory(short).report.warnings if one.code == "max_wait"]
+    assert [one.code for one in warned] == codes
+    # Single packets are no messages, however short the wait is.
+    shortest = in_memory(replace(short, max_wait_ns=10_000)).report.warnings
+    assert [one.code for one in shortest if one.code == "max_wait"] == codes
+    for one in warned:
+        found = re.fullmatch(
+            r"--max-wait 0\.015: expected more than a message of \S+, which holds (0\.\d+) s .*"
+            r"; give at least (0\.\d+)",
+            one.message,
+        )
+        assert found is not None, one.message
+        # Messages are cut by receive time: 20 ms, and a packet.
+        assert 0.018 < float(found[1]) <= 0.0214
+        assert float(found[2]) >= float(found[1]) + 0.01
 
 
 def test_the_page_on_recordings_lists_all_types_and_frames() -> None:

@@ -1,7 +1,7 @@
 """Sessions of the matrix in every container, with the rig that names their lidars.
 
-Messages: docs/sources/messages.md section 1; the bag for ROS 2 has scans of HESAI and Velodyne, of
-many packets a message, all others a message a packet.
+The bag for ROS 2 has scans of HESAI and Velodyne, of many packets a message, all others a message
+a packet.
 """
 
 from __future__ import annotations
@@ -11,12 +11,12 @@ from pathlib import Path
 
 import numpy as np
 
-from tests.builders.bags import Body, Recorded, packet_message
+from tests.builders.bags import Recorded
 from tests.builders.captures import Packet, Section, udp_frame, write_pcap, write_pcapng
+from tests.builders.messages import Unit, merged, messages
 from tests.builders.rosbag1 import write_rosbag1
 from tests.builders.rosbag2 import write_rosbag2
 from tests.builders.sessions_of_bags import write_mcap
-from tests.golden.vendor_messages import Unit, merged, nebula, scans, singles
 from tests.matrix.lidars import VENDORS, Sent
 
 # Scan messages contain the packets of so many ns, less than the shortest wait of the matrix.
@@ -24,15 +24,9 @@ SCAN_NS = 20_000_000
 Session = Sequence[Sent]
 
 
-def packets_of(sent: Sent) -> tuple[tuple[int, bytes], ...]:
+def packets_of(sent: Sent) -> list[tuple[int, bytes]]:
     """(receive time, payload)."""
-    return tuple(zip(sent.host_ns.tolist(), sent.payloads, strict=True))
-
-
-def unit(sent: Sent) -> Unit:
-    """As the builders of messages want it."""
-    vendor = VENDORS[sent.vendor]
-    return Unit(sent.vendor, vendor.ip, vendor.topic, packets_of(sent))
+    return list(zip(sent.host_ns.tolist(), sent.payloads, strict=True))
 
 
 def _frames(session: Session) -> list[tuple[int, bytes]]:
@@ -46,44 +40,9 @@ def _frames(session: Session) -> list[tuple[int, bytes]]:
     return sorted(records, key=lambda record: record[0])
 
 
-def _ouster(sent: Sent, encoding: str) -> list[Recorded]:
-    kind = {"cdr": "ouster_sensor_msgs/PacketMsg", "ros1": "ouster_ros/PacketMsg"}[encoding]
-    topic = VENDORS[sent.vendor].topic
-    return [
-        Recorded(topic, kind, host_ns, packet_message(encoding, payload))
-        for host_ns, payload in packets_of(sent)
-    ]
-
-
-def _robosense(sent: Sent, encoding: str) -> list[Recorded]:
-    """Header, is_difop, is_frame_begin, data."""
-    topic = VENDORS[sent.vendor].topic
-    kind = "rslidar_msg/RslidarPacket"
-    return [
-        Recorded(
-            topic,
-            kind,
-            host_ns,
-            Body(encoding).header(host_ns, "rslidar").put("B", 0, 0).blob(payload).done(),
-        )
-        for host_ns, payload in packets_of(sent)
-    ]
-
-
-def _messages(session: Session, encoding: str, *, in_scans: bool = False) -> list[Recorded]:
-    parts = []
-    for sent in session:
-        if sent.vendor == "ouster":
-            parts.append(_ouster(sent, encoding))
-        elif sent.vendor == "robosense":
-            parts.append(_robosense(sent, encoding))
-        elif in_scans:
-            parts.append(scans(unit(sent), encoding, SCAN_NS))
-        elif encoding == "cdr":
-            parts.append(nebula(unit(sent)))
-        else:
-            parts.append(singles(unit(sent), encoding))
-    return merged(*parts)
+def _messages(session: Session, encoding: str, scan_ns: int = 0) -> list[Recorded]:
+    units = [Unit(sent.vendor, VENDORS[sent.vendor].topic, packets_of(sent)) for sent in session]
+    return merged(*(messages(unit, encoding, scan_ns) for unit in units))
 
 
 def _pcap(folder: Path, session: Session) -> Path:
@@ -104,7 +63,7 @@ def _rosbag1(folder: Path, session: Session) -> Path:
 
 
 def _rosbag2(folder: Path, session: Session) -> Path:
-    return write_rosbag2(folder / "drive.db3", _messages(session, "cdr", in_scans=True))
+    return write_rosbag2(folder / "drive.db3", _messages(session, "cdr", SCAN_NS))
 
 
 CONTAINERS: Mapping[str, Callable[[Path, Session], Path]] = {
@@ -115,11 +74,6 @@ CONTAINERS: Mapping[str, Callable[[Path, Session], Path]] = {
     "rosbag2": _rosbag2,
 }
 CAPTURES = ("pcap", "pcapng")
-
-
-def names(session: Session) -> list[str]:
-    """Names of the sensors in the order of the rig: their vendors."""
-    return [sent.vendor for sent in session]
 
 
 def rig_text(session: Session, container: str, clocks: Mapping[str, str] | None = None) -> str:

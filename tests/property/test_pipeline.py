@@ -1,9 +1,11 @@
-"""Laws of whole conversions: scans depend only on the packets (docs/batching.md)."""
+"""Laws of whole conversions: scans depend only on the packets (docs/batching.md).
+
+Any order of arrival: test_permutations.py; bags: tests/golden and tests/matrix.
+"""
 
 from __future__ import annotations
 
 import gzip
-import random
 import warnings
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
@@ -149,38 +151,6 @@ def test_several_files_in_any_order_are_one_session(
     for path, records in zip(paths, parts(), strict=True):
         path.write_bytes(pcap_bytes(records))
     wanted.check(paths[::step], tmp_path, size)
-
-
-def shuffled(rng: random.Random) -> Records:
-    """Frames of the two sensors, newly interleaved, each in its own order, in bursts of any length.
-
-    All stamps are within 0.4 s: no sensor lags by more than --max-wait.
-    """
-    mine, others = (list(reversed(records)) for records in by_sensor())
-    burst = rng.choice([1, 4, 40, 400, 4000])
-    records: Records = []
-    while mine or others:
-        chosen = rng.choice([part for part in (mine, others) if part])
-        for _ in range(min(rng.randint(1, burst), len(chosen))):
-            records.append((START_NS + 100_000 * len(records), chosen.pop()[1]))
-    return records
-
-
-@pytest.mark.parametrize("seed", range(12))
-def test_interleaving_does_not_matter(seed: int, wanted: Wanted, tmp_path: Path) -> None:
-    rng = random.Random(seed)
-    path = tmp_path / "recording.pcap"
-    path.write_bytes(pcap_bytes(shuffled(rng)))
-    wanted.check([path], tmp_path, rng.choice(BUFFERS))
-
-
-@pytest.mark.parametrize("lag_ms", [-900, -300, 300, 900])
-def test_a_late_network_does_not_matter(lag_ms: int, wanted: Wanted, tmp_path: Path) -> None:
-    mine, others = by_sensor()
-    late = [(host_ns + lag_ms * 10**6, frame) for host_ns, frame in mine]
-    path = tmp_path / "recording.pcap"
-    path.write_bytes(pcap_bytes(sorted(late + others, key=lambda record: record[0])))
-    wanted.check([path], tmp_path)
 
 
 @pytest.mark.parametrize("size", [*BUFFERS, LARGE])

@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from fractions import Fraction
 from pathlib import Path
 
+import numpy as np
 import pytest
 
+from mlbatch.discovery.discover import SensorSelection
+from mlbatch.pipeline.job import Job
 from mlbatch.readers import open_recording
 from mlbatch.types import StreamTable
 from tests.builders.run import in_memory, prints
-from tests.golden.test_vendor_containers import job
-from tests.golden.vendor_messages import CONTAINERS, unit_of
+from tests.matrix.containers import CONTAINERS
+from tests.matrix.lidars import Sent
 from tests.recordings import RECORDINGS
 
 BAGS = {
@@ -19,24 +24,27 @@ BAGS = {
 }
 
 
-def packets_of(path: Path) -> tuple[tuple[int, bytes], ...]:
-    """Receive time and payload of all packets of a recording."""
-    found = []
+def sent_of(vendor: str, path: Path) -> Sent:
+    """All packets of a recording."""
+    payloads: list[bytes] = []
+    host_ns: list[int] = []
     for batch in open_recording(path, StreamTable()).packets():
-        places = (batch.host_ns, batch.start, batch.size)
-        for host_ns, start, size in zip(*(values.tolist() for values in places), strict=True):
-            found.append((host_ns, batch.data[start : start + size].tobytes()))
-    return tuple(found)
+        for start, size in zip(batch.start.tolist(), batch.size.tolist(), strict=True):
+            payloads.append(batch.data[start : start + size].tobytes())
+        host_ns += batch.host_ns.tolist()
+    none = np.empty(0, np.int64)
+    return Sent(vendor, tuple(payloads), np.array(host_ns), none, none)
 
 
 @pytest.mark.parametrize("vendor", BAGS)
 def test_packets_of_a_real_bag_in_other_containers(vendor: str, tmp_path: Path) -> None:
     folder, bag, file = BAGS[vendor]
-    metadata, source = RECORDINGS / folder / file, RECORDINGS / folder / bag
-    whole = prints(in_memory(job(metadata, source)))
+    source = RECORDINGS / folder / bag
+    selection = SensorSelection(metadata=(RECORDINGS / folder / file,), identity_extrinsics=True)
+    job = Job((source,), selection, Fraction(20), keep_partial=True)
+    whole = prints(in_memory(job))
     assert len(whole) > 6
-    unit = unit_of(vendor, packets_of(source))
-    for number, write in enumerate(CONTAINERS.values()):
-        (tmp_path / str(number)).mkdir()
-        path = write(tmp_path / str(number), (unit,))
-        assert prints(in_memory(job(metadata, path))) == whole
+    sent = sent_of(vendor, source)
+    for name, write in CONTAINERS.items():
+        path = write(tmp_path, [sent])
+        assert prints(in_memory(replace(job, recordings=(path,)))) == whole, name
