@@ -39,7 +39,6 @@ def merge(
     from mlbatch.pipeline.merge import merge as merge_parts
     from mlbatch.pipeline.merge import read_parts
     from mlbatch.report.limits import exceeded, parse_limits
-    from mlbatch.report.report import build_report
 
     limits = parse_limits(fail_on or ())
     command = shlex.join(["mlbatch", *sys.argv[1:]])
@@ -52,4 +51,4 @@ def merge(
     if not quiet:
         print_summary(report)
         typer.echo(one_line(f"wrote {output}, {len(parts)} shards merged"))
-    exit_beyond(exceeded(limits, build_report(report)))
+    exit_beyond(exceeded(limits, report))

@@ -27,7 +27,7 @@ from mlbatch.pipeline.conversion import Conversion, Progress
 from mlbatch.pipeline.interrupts import interruptible
 from mlbatch.pipeline.job import Job, TimeSegment
 from mlbatch.pipeline.output import Output, OutputRequest
-from mlbatch.report.report import RunReport, build_report, report_text
+from mlbatch.report.report import RunReport, report_of, report_text
 from mlbatch.writers import discard, report_paths
 
 # Loaded where it is needed: a dry run has no files.
@@ -98,7 +98,7 @@ def _run_one(job: Job, target: Target) -> list[str]:
     # Not loaded without limits.
     from mlbatch.report.limits import exceeded
 
-    return exceeded(target.limits, build_report(report))
+    return exceeded(target.limits, report)
 
 
 def _print_summary(
@@ -119,7 +119,7 @@ def _beyond_limits_before(target: Target, name: str) -> list[str]:
 
     path = target.request.report or report_paths(target.request.output, name).report
     try:
-        return exceeded(target.limits, parse_json(read_text(path)))
+        return exceeded(target.limits, RunReport.from_json(parse_json(read_text(path))))
     except (OSError, ValueError) as err:
         raise ExportError(
             f"{path}: expected the report of the complete output for --fail-on, found "
@@ -206,9 +206,9 @@ def _write_page(conversion: Conversion, inputs: RunReport, target: Target) -> No
         return
     # Not loaded for runs without a page.
     from mlbatch.page import write_page
-    from mlbatch.page.source import Source, read_report
+    from mlbatch.page.source import Source
 
-    report = read_report(target.html, report_text(inputs))
+    report = report_of(target.html, report_text(inputs))
     table = None if conversion.table is None else conversion.table.text()
     write_page(target.html, Source(report, table, target.written, target.html))
 

@@ -12,10 +12,11 @@ import numpy as np
 
 from mlbatch.digests.comparison import Difference, scan_name, walk
 from mlbatch.digests.fields import Values, fields_of
-from mlbatch.digests.run import describe_run, run_files
+from mlbatch.digests.run import describe_run
 from mlbatch.digests.values import Json, values
 from mlbatch.errors import UsageError
 from mlbatch.outputs.read import read
+from mlbatch.outputs.run_files import RunFiles
 from mlbatch.outputs.scan import Scan
 
 
@@ -73,7 +74,8 @@ def diff(a: Path, b: Path, tolerance: float = 0.0) -> OutputDiff:
     Raises RecordingError where one of them is damaged.
     """
     result = OutputDiff()
-    result.run += walk("", describe_run(run_files(a)), describe_run(run_files(b)), tolerance)
+    old, new = (describe_run(output, RunFiles.of(output).texts()[0]) for output in (a, b))
+    result.run += walk("", old, new, tolerance)
     for key, one, other in _pairs(a, b):
         name = scan_name(*key.window, key.sensor)
         if one is None or other is None:

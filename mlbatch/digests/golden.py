@@ -9,7 +9,7 @@ from pathlib import Path
 import mlbatch
 from mlbatch.bounded import parse_json, read_text
 from mlbatch.digests.fields import COLUMN_FIELDS, describe, fields_of
-from mlbatch.digests.run import describe_run, run_files
+from mlbatch.digests.run import describe_run
 from mlbatch.digests.values import Json, values
 from mlbatch.errors import RecordingError
 from mlbatch.outputs.read import read
@@ -25,10 +25,10 @@ _STAMPS = ("first_stamp_ns", "last_stamp_ns")
 
 def golden_of(output: Path) -> dict[str, Json]:
     """Describe an output; RecordingError where it is damaged."""
-    files = run_files(output)
+    report, table = RunFiles.of(output).texts()
     about: dict[str, Json] = {}
     scans: list[dict[str, Json]] = []
-    stamps = _stamps(files)
+    stamps = _stamps(output, table)
     for scan in read(output):
         if not about:
             about = {"frame_id": scan.frame_id, "layout": scan.info.layout}
@@ -37,14 +37,14 @@ def golden_of(output: Path) -> dict[str, Json]:
         raise RecordingError(
             f"{output}: expected scans to describe, found none; see `mlbatch verify`"
         )
-    return {"schema": SCHEMA, **about, "run": describe_run(files), "scans": [*scans]}
+    return {"schema": SCHEMA, **about, "run": describe_run(output, report), "scans": [*scans]}
 
 
-def _stamps(files: RunFiles) -> dict[tuple[int, int], dict[str, Json]]:
+def _stamps(output: Path, table: str | None) -> dict[tuple[int, int], dict[str, Json]]:
     """First and last stamp of the scans by index and slice, from scans.csv."""
-    if not files.table:
+    if table is None:
         return {}
-    rows = read_table(files.table, f"{files.where}: scans.csv")
+    rows = read_table(table, f"{output}: scans.csv")
     return {
         (int(row["index"]), int(row["slice"])): {name: int(row[name]) for name in _STAMPS}
         for row in rows

@@ -2,14 +2,10 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
-from mlbatch.bounded import parse_json
 from mlbatch.digests.values import Json
 from mlbatch.errors import RecordingError
-from mlbatch.outputs.run_files import RunFiles
+from mlbatch.report.report import parse_report
 
-_SCHEMA = "mlbatch.report/1"
 # Accounts that do not depend on the container of a recording.
 _SENSOR = (
     *("name", "model", "lidar_id", "packets", "imu_packets", "imu_samples", "columns", "points"),
@@ -25,37 +21,15 @@ _GRID = (
 )
 
 
-def run_files(output: Path) -> RunFiles:
-    """Report and table in or next to an output; those inside of an MCAP file without others."""
-    found = RunFiles.of(output)
-    if found.report and found.table:
-        return found
-    report, table = _inside(output)
-    return RunFiles(found.where, found.report or report, found.table or table)
-
-
-def _inside(output: Path) -> tuple[str, str]:
-    from mlbatch.outputs.damage import CheckLog
-    from mlbatch.outputs.mcap_file import McapFile
-
-    if not output.is_file() or not output.name.endswith(".mcap"):
-        return "", ""
-    file = McapFile(CheckLog(), output, output.name)
-    report = file.metadata.get("mlbatch.report", {}).get("json", "")
-    return report, file.attachments.get("scans.csv", b"").decode("utf-8", "replace")
-
-
-def describe_run(files: RunFiles) -> dict[str, Json]:
-    """Grid, accounts, poses and warning codes of a run; nothing without a report.
+def describe_run(where: object, text: str | None) -> dict[str, Json]:
+    """Grid, accounts, poses and warning codes of a run, from its report; nothing without one.
 
     Raises RecordingError for a report of another program.
     """
-    if not files.report:
+    if text is None:
         return {}
+    report = parse_report(where, text)
     try:
-        report = parse_json(files.report)
-        if report["schema"] != _SCHEMA:
-            raise ValueError(report["schema"])
         return {
             "timescale": report["timescale"],
             "grid": _chosen(report["grid"], _GRID),
@@ -67,7 +41,7 @@ def describe_run(files: RunFiles) -> dict[str, Json]:
         }
     except (KeyError, TypeError, ValueError) as err:
         raise RecordingError(
-            f"{files.where}: expected a report of the schema {_SCHEMA}, found a damaged one "
+            f"{where}: expected a report of the run, found a damaged one "
             f"({type(err).__name__}: {err}); restore it, or convert again"
         ) from err
 

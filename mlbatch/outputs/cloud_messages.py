@@ -6,15 +6,15 @@ Sources: docs/sources/outputs.md sections 2 to 4; sensor_msgs of ROS.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
 
-from mlbatch.arrays import F32Array, F64Array, I64Array, U8Array, U16Array
+from mlbatch.arrays import F64Array
 from mlbatch.outputs.damage import DamageError
 from mlbatch.outputs.encoding import MessageCursor
-from mlbatch.outputs.stored_scan import StoredScan
+from mlbatch.outputs.stored_scan import StoredScan, seconds_to_ns
 
 CLOUD = "sensor_msgs/PointCloud2"
 _NS = 10**9
@@ -137,58 +137,42 @@ def read_cloud(cursor: MessageCursor) -> Cloud:
 def stored_scan(cloud: Cloud, where: str, sensor: int | None) -> StoredScan:
     """The message as a scan; an organized one is transposed: its rows are columns."""
     organized = not cloud.is_dense
-    records = cloud.records.T if organized else cloud.records.reshape(-1)
-    names = {name for name, _, _ in PRESETS[cloud.layout].fields}
-    time_ns, step_ns = _times(cloud, records)
-    xyz: F32Array = records["xyz"]
-    scan = StoredScan(where, cloud.stamp_ns, xyz, organized, sensor)
-    scan.time_ns = time_ns
-    scan.time_step_ns = step_ns
+    records: Any = cloud.records.T if organized else cloud.records.reshape(-1)
+    names = records.dtype.names or ()
+    scan = StoredScan(where, cloud.stamp_ns, records["xyz"], organized, sensor)
+    _add_times(scan, PRESETS[cloud.layout].time, records)
+    # The `channel` of `autoware` is a ring of its sensor, not of the run.
+    for name in ("reflectivity", "ring", "return_type", "lidar_id"):
+        if name in names:
+            setattr(scan, name, records[name])
     if "intensity" in names:
         # An intensity of one byte has no NaN for empty slots.
-        if records.dtype["intensity"].kind == "f":
-            scan.intensity = records["intensity"]
-        else:
-            scan.byte_intensity = records["intensity"]
+        is_real = records.dtype["intensity"].kind == "f"
+        setattr(scan, "intensity" if is_real else "byte_intensity", records["intensity"])
     if "range" in names:
-        range_m: F64Array = records["range"] / 1000.0
-        scan.range_m = range_m
+        scan.range_m = records["range"] / 1000.0
     if "distance" in names:
-        distance_m: F32Array = records["distance"]
-        scan.distance_m = distance_m
-    if "azimuth" in names:
-        angles_rad: tuple[F32Array, F32Array] = (records["azimuth"], records["elevation"])
-        scan.angles_rad = angles_rad
-    # The `channel` of `autoware` is a ring of its sensor, not of the run.
-    if "ring" in names:
-        ring: U16Array = records["ring"]
-        scan.ring = ring
-    if "return_type" in names:
-        return_type: U8Array = records["return_type"]
-        scan.return_type = return_type
-    if "lidar_id" in names:
-        lidar_id: U8Array = records["lidar_id"]
-        scan.lidar_id = lidar_id
+        scan.distance_m = records["distance"]
+        scan.angles_rad = (records["azimuth"], records["elevation"])
     return scan
 
 
-def _times(cloud: Cloud, records: Records) -> tuple[I64Array | None, int]:
-    """Times after the stamp, ns, and their largest error."""
-    name = PRESETS[cloud.layout].time
+def _add_times(scan: StoredScan, name: str | None, records: Any) -> None:
+    """Add the times after the stamp, and their largest error."""
     if name is None:
-        return None, 0
+        return
     values = records[name]
     if name in ("t", "time_stamp"):
-        return values.astype(np.int64), 0
+        scan.time_ns = values.astype(np.int64)
+        return
     if not np.isfinite(values).all():
         raise DamageError(f"a finite {name}", "NaN or infinity")
     if name == "time":
-        # Rounded toward zero: never later than the true time.
-        time_s: F64Array = np.clip(values.astype(np.float64), -4.0, 4e9 / _NS)
-        step_s = float(np.spacing(np.float32(np.abs(time_s).max(initial=0))))
-        return np.floor(time_s * _NS).astype(np.int64), int(step_s * _NS) + 1
+        scan.time_s = values
+        scan.time_ns, scan.time_step_ns = seconds_to_ns(values)
+        return
     # Times of the clock; those of empty slots are the start.
-    whole_s, rest_ns = divmod(cloud.stamp_ns, _NS)
+    whole_s, rest_ns = divmod(scan.start_ns, _NS)
     after_s: F64Array = np.clip(values - whole_s, -4.0, 5.0)
-    step_s = float(np.spacing(np.abs(values).max(initial=0)))
-    return np.rint(after_s * _NS).astype(np.int64) - rest_ns, int(step_s * _NS) + 1
+    scan.time_ns = np.rint(after_s * _NS).astype(np.int64) - rest_ns
+    scan.time_step_ns = int(float(np.spacing(np.abs(values).max(initial=0))) * _NS) + 1

@@ -2,22 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass, field
-from typing import Any, TypeAlias
+from typing import Any, TypeAlias, cast
 
 import numpy as np
 import numpy.typing as npt
 
-from mlbatch.arrays import BoolArray, F32Array, F64Array, I64Array, U8Array
+from mlbatch.arrays import BoolArray, F32Array, F64Array, I64Array, U8Array, U16Array
 from mlbatch.outputs.comments import ScanComments
-from mlbatch.outputs.damage import CheckLog, DamageError
-from mlbatch.outputs.folders import ScanFile, readable
+from mlbatch.outputs.damage import DamageError
+from mlbatch.outputs.folders import ScanFile, ScanReader
 from mlbatch.outputs.metadata import RunMetadata
-from mlbatch.outputs.stored_scan import StoredScan
-
-_NS = 1e9
-_MOST_S = 4.0
+from mlbatch.outputs.stored_scan import StoredScan, seconds_to_ns
 
 Values: TypeAlias = npt.NDArray[np.generic]
 
@@ -39,12 +35,9 @@ class StoredPoints:
 
 
 @dataclass(slots=True)
-class CommentedReader:
+class CommentedReader(ScanReader):
     """Reads the files of one folder; all of a run have the same metadata."""
 
-    log: CheckLog
-    sensors: tuple[str, ...] = ()
-    organized: bool = False
     _metadata: RunMetadata = field(default_factory=RunMetadata)
 
     def parse(self, data: bytes) -> tuple[ScanComments, StoredPoints]:
@@ -59,11 +52,8 @@ class CommentedReader:
         self.organized = points.organized
         return self._metadata
 
-    def scans(self, files: list[ScanFile]) -> Iterator[StoredScan]:
-        """Every readable scan; the others are violations."""
-        return readable(self.log, files, self._scan)
-
-    def _scan(self, file: ScanFile) -> StoredScan:
+    def scan(self, file: ScanFile) -> StoredScan:
+        """One scan, checked against the others."""
         log = self.log
         comments, points = self.parse(file.read())
         log.ok("layout")
@@ -84,8 +74,10 @@ class CommentedReader:
             organized=points.organized,
             sensor=file.sensor_index(log, self.sensors),
             intensity=points.intensity,
+            reflectivity=cast("U16Array | None", points.reflectivity),
             time_ns=time_ns,
             time_step_ns=step_ns,
+            time_s=points.time_s,
             ring=self._labels("rings", where, points.ring, np.dtype("u2")),
             return_type=_bytes(self._labels("returns", where, points.return_type, np.dtype("u1"))),
             lidar_id=_bytes(self._labels("sensors", where, points.lidar_id, np.dtype("u1"))),
@@ -103,13 +95,7 @@ class CommentedReader:
         if bad.any():
             found = time_s.reshape(-1).item
             self.log.none("times", where, bad.reshape(-1), "a finite number", found)
-        # Before the conversion, which warns of signalling NaN.
-        exact_s: F64Array = np.clip(np.nan_to_num(time_s).astype(np.float64), -_MOST_S, _MOST_S)
-        if time_s.dtype.itemsize > np.dtype("f4").itemsize:
-            return np.rint(exact_s * _NS).astype(np.int64), 0
-        # Rounded toward zero: never later than the true time.
-        step_s = float(np.spacing(np.float32(np.abs(exact_s).max(initial=0))))
-        return np.floor(exact_s * _NS).astype(np.int64), int(step_s * _NS) + 1
+        return seconds_to_ns(time_s)
 
     def _labels(
         self,

@@ -12,15 +12,15 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from mlbatch.arrays import BoolArray
-from mlbatch.errors import MlbatchError
+from mlbatch.errors import RecordingError
 
 # Violations that are kept; all are counted.
 MAX_KEPT = 1000
 _MAX_TEXT = 160
 
 
-class VerifyError(MlbatchError):
-    """An output that cannot be checked: missing, of another program, damaged beyond reading."""
+class VerifyError(RecordingError):
+    """An output that cannot be read: missing, of another program, damaged beyond reading."""
 
 
 class DamageError(Exception):

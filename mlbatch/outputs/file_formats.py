@@ -8,15 +8,11 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TypeAlias
 
-from mlbatch.outputs import float_rows, las, npz, pcd, ply
-from mlbatch.outputs.commented import CommentedReader
+from mlbatch.outputs import float_rows as rows
+from mlbatch.outputs import las, npz, pcd, ply
 from mlbatch.outputs.damage import CheckLog
-from mlbatch.outputs.float_rows import RowReader
-from mlbatch.outputs.npz import NpzReader
-
-FileReader: TypeAlias = NpzReader | CommentedReader | RowReader
+from mlbatch.outputs.folders import ScanReader
 
 _RANGES = "ranges to 1 m: beams do not leave from the origin of their sensor"
 
@@ -27,19 +23,19 @@ class FileFormat:
 
     name: str
     suffix: str
-    reader: Callable[[CheckLog], FileReader]
+    reader: Callable[[CheckLog], ScanReader]
     limits: Mapping[str, str]
 
 
 # In the order in which suffixes are looked for: that of kitti is the end of that of nuscenes.
 FILE_FORMATS = (
-    FileFormat("npz", npz.SUFFIX, NpzReader, npz.LIMITS | {"geometry": _RANGES}),
+    FileFormat("npz", npz.SUFFIX, npz.NpzReader, npz.LIMITS | {"geometry": _RANGES}),
     FileFormat("ply", ply.SUFFIX, ply.PlyReader, ply.LIMITS),
     FileFormat("pcd", pcd.SUFFIX, pcd.PcdReader, pcd.LIMITS),
     FileFormat("las", las.LAS_SUFFIX, las.LasReader, las.LIMITS),
     FileFormat("laz", las.LAZ_SUFFIX, las.LasReader, las.LIMITS),
-    FileFormat("nuscenes", float_rows.NUSCENES_SUFFIX, RowReader, float_rows.NUSCENES_LIMITS),
-    FileFormat("kitti", float_rows.KITTI_SUFFIX, RowReader, float_rows.KITTI_LIMITS),
+    FileFormat("nuscenes", rows.NUSCENES_SUFFIX, rows.RowReader, rows.NUSCENES_LIMITS),
+    FileFormat("kitti", rows.KITTI_SUFFIX, rows.RowReader, rows.KITTI_LIMITS),
 )
 
 

@@ -6,7 +6,6 @@ The format: docs/formats.md.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -15,9 +14,9 @@ import numpy as np
 from mlbatch.arrays import BoolArray, F32Array, F64Array, I64Array
 from mlbatch.bounded import read_text
 from mlbatch.outputs.damage import CheckLog, DamageError
-from mlbatch.outputs.folders import ScanFile, readable, scan_files
+from mlbatch.outputs.folders import ScanFile, ScanReader, scan_files
 from mlbatch.outputs.metadata import RunMetadata
-from mlbatch.outputs.stored_scan import StoredScan
+from mlbatch.outputs.stored_scan import StoredScan, seconds_to_ns
 
 KITTI_SUFFIX = ".bin"
 NUSCENES_SUFFIX = ".pcd.bin"
@@ -25,7 +24,6 @@ TIME_SUFFIX = ".time.bin"
 TIMES_TXT = "times.txt"
 _TIME = re.compile(r"(\d{1,10})\.(\d{9})", re.ASCII)
 _NS = 10**9
-_MOST_S = 4.0
 _BYTES = 4
 
 _COMMON = {
@@ -109,12 +107,9 @@ def start_of(file: ScanFile, known: dict[Path, dict[Path, int]]) -> int:
 
 
 @dataclass(slots=True)
-class RowReader:
+class RowReader(ScanReader):
     """Reads the files of one folder."""
 
-    log: CheckLog
-    sensors: tuple[str, ...] = ()
-    organized: bool = False
     _slices: int = 1
     _starts: dict[Path, dict[Path, int]] = field(default_factory=dict)
 
@@ -127,11 +122,8 @@ class RowReader:
         self.sensors = metadata.sensors or ()
         self._slices = metadata.slices or 1
 
-    def scans(self, files: list[ScanFile]) -> Iterator[StoredScan]:
-        """Every readable scan; the others are violations."""
-        return readable(self.log, files, self._scan)
-
-    def _scan(self, file: ScanFile) -> StoredScan:
+    def scan(self, file: ScanFile) -> StoredScan:
+        """One scan, checked against the others."""
         found = read_rows(file)
         self.log.ok("layout")
         part = file.slice or 0
@@ -155,11 +147,8 @@ class RowReader:
         finite: BoolArray = np.isfinite(time_s)
         bad: BoolArray = np.logical_not(finite)
         self.log.none("times", scan.point, bad, "a finite number", time_s.item)
-        exact: F64Array = np.clip(np.nan_to_num(time_s).astype(np.float64), -_MOST_S, _MOST_S)
-        step_s = float(np.spacing(np.float32(np.abs(exact).max(initial=0))))
-        # Rounded toward zero: never later than the true time.
-        scan.time_ns = np.floor(exact * _NS).astype(np.int64)
-        scan.time_step_ns = int(step_s * _NS) + 1
+        scan.time_ns, scan.time_step_ns = seconds_to_ns(time_s)
+        scan.time_s = time_s
         scan.ring = self._whole("rings", scan, ring, 65535)
         scan.lidar_id = self._whole("sensors", scan, lidar, 255).astype(np.uint8)
 

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import re
 import zlib
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
 from mlbatch.bounded import MOST_TABLE_BYTES, read_bytes
 from mlbatch.outputs.damage import CheckLog, DamageError, VerifyError
+from mlbatch.outputs.metadata import RunMetadata
 from mlbatch.outputs.stored_scan import StoredScan
 
 _NAME = re.compile(r"(?:(\d{6,})|(head))(?:-(\d+))?", re.ASCII)
@@ -63,24 +64,38 @@ class ScanFile:
         return None
 
 
-def readable(
-    log: CheckLog, files: Iterable[ScanFile], read: Callable[[ScanFile], StoredScan | None]
-) -> Iterator[StoredScan]:
-    """Yield the scan of every file that can be read; the others are violations.
+@dataclass(slots=True)
+class ScanReader:
+    """Reads the files of one folder, which are of one run."""
 
-    read: None where a scan is not in its layout.
-    """
-    for file in files:
-        file.checksum = 0
-        try:
-            scan = read(file)
-        except DamageError as err:
-            log.fail("container", file.where, err.expected, err.found)
-            continue
-        log.ok("container")
-        if scan is not None:
-            scan.checksum = file.checksum
-            yield scan
+    log: CheckLog
+    sensors: tuple[str, ...] = ()
+    organized: bool = False
+
+    def begin(self, file: ScanFile) -> RunMetadata:
+        """Metadata of the run in the first scan; DamageError for another file. By format."""
+        raise NotImplementedError
+
+    def know(self, metadata: RunMetadata) -> None:
+        """Take over what the report has, in formats whose files have none."""
+
+    def scan(self, file: ScanFile) -> StoredScan | None:
+        """One scan, None if it is not in its layout; DamageError for another file. By format."""
+        raise NotImplementedError
+
+    def scans(self, files: Iterable[ScanFile]) -> Iterator[StoredScan]:
+        """Every readable scan; the others are violations."""
+        for file in files:
+            file.checksum = 0
+            try:
+                scan = self.scan(file)
+            except DamageError as err:
+                self.log.fail("container", file.where, err.expected, err.found)
+                continue
+            self.log.ok("container")
+            if scan is not None:
+                scan.checksum = file.checksum
+                yield scan
 
 
 def entries(folder: Path) -> list[Path]:

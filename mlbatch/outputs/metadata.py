@@ -34,6 +34,12 @@ class RunMetadata:
     deskew_to: str | None = None
 
     @property
+    def variants(self) -> tuple[tuple[str, str], ...]:
+        """The options that change what a scan is, as `RunInfo.variants`."""
+        found = ((name, getattr(self, name)) for name in VARIANTS)
+        return tuple((name, value) for name, value in found if value is not None)
+
+    @property
     def limits(self) -> dict[str, str]:
         """Checks that such options make impossible, and why."""
         limits: dict[str, str] = {}

@@ -6,11 +6,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 from dataclasses import dataclass, field
 from functools import lru_cache
 from io import BytesIO
-from typing import Any, cast
+from typing import cast
 from zipfile import ZIP_DEFLATED, ZIP_STORED, ZipFile
 
 import numpy as np
@@ -19,8 +18,8 @@ from numpy.lib.format import read_array_header_1_0, read_magic
 
 from mlbatch.arrays import F32Array, I64Array, U8Array, U16Array, U32Array
 from mlbatch.outputs.containers import check_unpacked_size, library_errors
-from mlbatch.outputs.damage import CheckLog, DamageError
-from mlbatch.outputs.folders import ScanFile, readable
+from mlbatch.outputs.damage import DamageError
+from mlbatch.outputs.folders import ScanFile, ScanReader
 from mlbatch.outputs.metadata import RunMetadata, with_variants
 from mlbatch.outputs.stored_scan import StoredScan
 from mlbatch.types import VARIANTS
@@ -65,12 +64,9 @@ Values = npt.NDArray[np.generic]
 
 
 @dataclass(slots=True)
-class NpzReader:
+class NpzReader(ScanReader):
     """Reads the files of one folder; all of a run have the same keys and constants."""
 
-    log: CheckLog
-    sensors: tuple[str, ...] = ()
-    organized: bool = False
     _first: str = ""
     _keys: dict[str | None, frozenset[str]] = field(default_factory=dict)
     # Bytes and values of the constants of the first scan.
@@ -116,11 +112,8 @@ class NpzReader:
         found = expected if fits else f"{kind} of {values.ndim} axes"
         return self.log.equal("layout", f"{file.where} {key}", expected, found)
 
-    def scans(self, files: list[ScanFile]) -> Iterator[StoredScan]:
-        """Every readable scan; the others are violations."""
-        return readable(self.log, files, self._scan)
-
-    def _scan(self, file: ScanFile) -> StoredScan | None:
+    def scan(self, file: ScanFile) -> StoredScan | None:
+        """One scan, checked against the others."""
         data = _members(file)
         self._check_keys(file, data)
         values = {
@@ -190,6 +183,7 @@ class NpzReader:
             organized=self.organized,
             sensor=file.sensor_index(self.log, self.sensors),
             intensity=cast(F32Array, values["intensity"]),
+            reflectivity=cast("U16Array | None", values.get("reflectivity")),
             range_m=cast(F32Array, values["range_m"]),
             time_ns=cast(I64Array, values["time_ns"].astype(np.int64)),
             ring=cast(U16Array, values["ring"]),
@@ -200,12 +194,6 @@ class NpzReader:
             column_lidar_id=cast(U8Array, values["column_lidar_id"]),
             fill=cast(F32Array, values["fill"]),
         )
-
-
-def arrays_of(file: ScanFile) -> dict[str, npt.NDArray[Any]]:
-    """All arrays of a file by key, of its own memory."""
-    members = _members(file)
-    return {key: _array(key, members.pop(key)).copy() for key in list(members)}
 
 
 def _members(file: ScanFile) -> dict[str, bytes]:

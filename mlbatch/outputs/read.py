@@ -5,37 +5,48 @@ Anything that the readers of a format report as damaged is an error here.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
+import numpy.typing as npt
 
-from mlbatch.bounded import parse_json
-from mlbatch.errors import RecordingError
-from mlbatch.outputs.cloud_messages import CLOUD, read_cloud
-from mlbatch.outputs.clouds import CloudPlace, Values, scan_of_cloud, scan_of_fields
-from mlbatch.outputs.commented import CommentedReader
-from mlbatch.outputs.damage import CheckLog, DamageError, VerifyError
-from mlbatch.outputs.float_rows import KITTI_SUFFIX, NUSCENES_SUFFIX, read_rows, start_of
+from mlbatch.batching.grid import Grid
+from mlbatch.errors import RecordingError, UsageError
+from mlbatch.outputs.cloud_messages import CLOUD, read_cloud, stored_scan
+from mlbatch.outputs.containers import Message
+from mlbatch.outputs.damage import CheckLog, DamageError
+from mlbatch.outputs.encoding import MessageCursor
+from mlbatch.outputs.file_formats import FileFormat, format_of
 from mlbatch.outputs.folders import ScanFile, scan_files
 from mlbatch.outputs.kinds import kind_of
-from mlbatch.outputs.las import LasReader
-from mlbatch.outputs.npz import arrays_of
-from mlbatch.outputs.pcd import PcdReader
-from mlbatch.outputs.ply import PlyReader
-from mlbatch.outputs.run_files import RunFiles, RunOfOutput, row_of, variants_of
+from mlbatch.outputs.metadata import RunMetadata, metadata_of_grid
+from mlbatch.outputs.run_files import PIECES, RunFiles, inner_texts
 from mlbatch.outputs.scan import Scan
-from mlbatch.outputs.table import ScanRow, TableOfRun
-from mlbatch.types import RunInfo
-from mlbatch.writers.atomic import PARTIAL_SUFFIX
+from mlbatch.outputs.stored_scan import StoredScan
+from mlbatch.outputs.table import ScanRow, TableOfRun, read_table
+from mlbatch.report.report import RunReport, report_of
+from mlbatch.types import RunInfo, SensorInfo
+from mlbatch.units import NS_PER_S, parse_rate
 
 if TYPE_CHECKING:
     from mlbatch.outputs.mcap_file import McapFile
 
-_SCHEMA = "mlbatch.scan/1"
-_WITHOUT_HEADER = (NUSCENES_SUFFIX, KITTI_SUFFIX)
+Array: TypeAlias = npt.NDArray[Any]
+_PARTIAL = ".partial"
+_COLUMN_ARRAYS = ("column", "column_stamp_ns", "column_lidar_id")
+# Arrays of points, and their types.
+_KINDS = {
+    "intensity": "<f4",
+    "reflectivity": "<u2",
+    "range_m": "<f4",
+    "time_ns": "<u4",
+    "ring": "<u2",
+    "return_type": "u1",
+    "lidar_id": "u1",
+}
 
 
 def read(path: Path) -> Iterator[Scan]:
@@ -44,48 +55,26 @@ def read(path: Path) -> Iterator[Scan]:
     path: a .mcap or .bag file, a folder (files of scans, ROS 2 bag), or one file of a scan. Raises
     RecordingError where the output is damaged, unfinished or of another program.
     """
-    if path.name.endswith(PARTIAL_SUFFIX):
+    if path.name.endswith(_PARTIAL):
         raise RecordingError(
             f"{path}: expected a finished output, found that of an unfinished run; convert again, "
             "or continue it with --resume"
         )
-    try:
-        yield from _scans(path)
-    except VerifyError as err:
-        raise RecordingError(str(err)) from err
-
-
-def _scans(path: Path) -> Iterator[Scan]:
     kind = kind_of(path)
-    if kind.name == "mcap":
-        return _scans_of_mcap(path, {path.name: path})
-    if kind.name == "rosbag1":
-        return _scans_of_bag(path)
     log = CheckLog()
-    if kind.name == "rosbag2":
+    if kind.name == "mcap":
+        yield from _scans_of_mcaps(log, path, {path.name: path})
+    elif kind.name == "rosbag1":
+        yield from _scans_of_bag(log, path)
+    elif kind.name == "rosbag2":
         from mlbatch.outputs.rosbag2 import open_bag
 
         bag, _ = open_bag(log, path)
-        _refuse_damage(log, path)
-        return _scans_of_mcap(path, {f"{path.name}/{file.name}": file for file in bag})
-    if kind.form is not None:
-        files = scan_files(log, path, kind.form.suffix)
-        _refuse_damage(log, path)
-        return _scans_of_files(path, kind.form.suffix, files)
-    suffix = next((one for one in _FILE_READERS if path.name.endswith(one)), None)
-    if suffix is not None and path.is_file():
-        folder = path.parent
-        named = [file for file in scan_files(log, folder, suffix) if file.path == path]
-        # The files of a sensor are in a folder of their own.
-        if not RunFiles.of(folder).report and RunFiles.of(folder.parent).report:
-            folder = folder.parent
-            named = [file for file in scan_files(log, folder, suffix) if file.path == path]
-        if named:
-            return _scans_of_files(folder, suffix, named)
-    raise RecordingError(
-        f"{path}: expected an output of `mlbatch convert` (a .mcap or .bag file, or a folder), "
-        f"found {kind.found}; name one"
-    )
+        yield from _scans_of_mcaps(log, path, {f"{path.name}/{file.name}": file for file in bag})
+    elif kind.form is not None:
+        yield from _scans_of_files(path, kind.form, scan_files(log, path, kind.form.suffix), log)
+    else:
+        yield from _scans_of_file(path, kind.found)
 
 
 def _refuse_damage(log: CheckLog, path: Path) -> None:
@@ -100,24 +89,20 @@ def _refuse_damage(log: CheckLog, path: Path) -> None:
 # -- messages -------------------------------------------------------------------------------------
 
 
-def _scans_of_mcap(output: Path, paths: Mapping[str, Path]) -> Iterator[Scan]:
+def _scans_of_mcaps(log: CheckLog, output: Path, paths: Mapping[str, Path]) -> Iterator[Scan]:
     """The scans of an output of MCAP files; paths: of all, by their names for errors."""
     from mlbatch.outputs.mcap_file import McapFile
 
-    log = CheckLog()
-    clouds: _Clouds | None = None
+    _refuse_damage(log, output)
+    run: _Run | None = None
     for where, path in paths.items():
         file = McapFile(log, path, where)
-        if clouds is None:
-            clouds = _Clouds(_run_of_mcap(output, path, file))
-        for message in file.messages():
-            _refuse_damage(log, path)
-            if message.type == CLOUD:
-                yield from clouds.scan(message.topic, message.data, message.encoding)
-        _refuse_damage(log, path)
+        if run is None:
+            run = _run_of_mcap(log, output, path, file)
+        yield from _scans_of_messages(log, path, run, file.messages())
 
 
-def _run_of_mcap(output: Path, path: Path, file: McapFile) -> RunOfOutput:
+def _run_of_mcap(log: CheckLog, output: Path, path: Path, file: McapFile) -> _Run:
     """The constants of a run in its first file; report and table may be in the folder."""
     grid = file.metadata.get("mlbatch.grid")
     if grid is None:
@@ -125,288 +110,262 @@ def _run_of_mcap(output: Path, path: Path, file: McapFile) -> RunOfOutput:
             f"{path}: expected an MCAP file of mlbatch, with a metadata record mlbatch.grid, found "
             "another; name the output of `mlbatch convert`"
         )
-    if "windows_per_file" in grid and not output.is_dir():
+    if PIECES in grid and not output.is_dir():
         raise RecordingError(
             f"{path}: expected a whole output, found one of the files of a bag; name its folder"
         )
-    report = file.metadata.get("mlbatch.report", {}).get("json", "")
-    table = file.attachments.get("scans.csv", b"").decode("utf-8", "replace")
-    own = RunFiles(str(path), report, table)
-    try:
-        return RunOfOutput(
-            str(path),
-            tuple(map(str, parse_json(grid["sensors"]))),
-            grid["rate_hz"],
-            int(grid["slices"]),
-            grid["timescale"],
-            int(grid["t_init_ns"]),
-            grid.get("sort", "columns"),
-            RunFiles.of(output) if "windows_per_file" in grid else own,
-            variants_of(grid),
-        )
-    except (KeyError, TypeError, ValueError) as err:
-        raise RecordingError(
-            f"{path}: expected rate, slices and sensors in mlbatch.grid, found "
-            f"{type(err).__name__}: {err}; convert again"
-        ) from err
+    report, table = inner_texts(file)
+    if PIECES in grid:
+        files = RunFiles.of(output)
+        report, table = files.report_text(), files.table_text()
+    metadata = metadata_of_grid(log, path.name, grid)
+    _refuse_damage(log, path)
+    return _Run(str(path), metadata, report, table)
 
 
-def _scans_of_bag(path: Path) -> Iterator[Scan]:
+def _scans_of_bag(log: CheckLog, path: Path) -> Iterator[Scan]:
     from mlbatch.outputs.rosbag1 import BagFile
 
-    log = CheckLog()
-    clouds = _Clouds(RunFiles.of(path).about())
-    for message in BagFile(log, path, path.name).messages():
+    files = RunFiles.of(path)
+    run = _Run(str(path), RunMetadata(), files.report_text(), files.table_text())
+    yield from _scans_of_messages(log, path, run, BagFile(log, path, path.name).messages())
+
+
+def _scans_of_messages(
+    log: CheckLog, path: Path, run: _Run, messages: Iterable[Message]
+) -> Iterator[Scan]:
+    topics = {"/points": None} | {f"/{name}/points": i for i, name in enumerate(run.sensors)}
+    for message in messages:
         _refuse_damage(log, path)
-        if message.type == CLOUD:
-            yield from clouds.scan(message.topic, message.data, message.encoding)
+        if message.type != CLOUD or message.topic not in topics:
+            continue
+        try:
+            cloud = read_cloud(MessageCursor.of_message(message.data, message.encoding))
+            index, part, start_ns, end_ns = run.window_of_message(cloud.stamp_ns)
+            cloud = replace(cloud, stamp_ns=start_ns)
+            stored = stored_scan(cloud, message.where, topics[message.topic])
+        except DamageError as err:
+            raise RecordingError(f"{path}: {message.topic}: {err}; convert again") from err
+        stored.index, stored.slice, stored.end_ns = index, part, end_ns
+        yield run.scan(stored, cloud.frame_id)
     _refuse_damage(log, path)
 
 
-class _Clouds:
-    """Converts the messages of a run to scans."""
+# -- a file for each scan -------------------------------------------------------------------------
 
-    def __init__(self, about: RunOfOutput) -> None:
-        self._about = about
-        self._places = about.places()
-        self._table = about.table()
-        self._infos: dict[tuple[str, str], RunInfo] = {}
-        # Clouds so far.
+
+def _scans_of_file(path: Path, found: str) -> Iterator[Scan]:
+    """The scan of one file of a folder."""
+    form = format_of([path])
+    if form is not None and path.is_file():
+        folder = path.parent
+        # The files of a sensor are in a folder of their own.
+        if not RunFiles.of(folder).report.exists() and RunFiles.of(folder.parent).report.exists():
+            folder = folder.parent
+        files = [one for one in scan_files(CheckLog(), folder, form.suffix) if one.path == path]
+        if files:
+            yield from _scans_of_files(folder, form, files, CheckLog())
+            return
+    raise RecordingError(
+        f"{path}: expected an output of `mlbatch convert` (a .mcap or .bag file, or a folder), "
+        f"found {found}; name one"
+    )
+
+
+def _scans_of_files(
+    folder: Path, form: FileFormat, files: list[ScanFile], log: CheckLog
+) -> Iterator[Scan]:
+    _refuse_damage(log, folder)
+    reader = form.reader(log)
+    try:
+        metadata = reader.begin(files[0]) if files else RunMetadata()
+    except DamageError as err:
+        raise RecordingError(
+            f"{files[0].path}: {err}; see `mlbatch verify`, and convert again"
+        ) from err
+    _refuse_damage(log, folder)
+    texts = RunFiles.of(folder)
+    run = _Run(str(folder), metadata, texts.report_text(), texts.table_text())
+    reader.know(run.metadata)
+    for stored in reader.scans(files):
+        _refuse_damage(log, folder)
+        yield run.scan(stored, metadata.frame_id or "")
+    _refuse_damage(log, folder)
+
+
+# -- scans ----------------------------------------------------------------------------------------
+
+
+class _Run:
+    """The constants of a run, and what its report and scans.csv say of scans."""
+
+    def __init__(
+        self, where: str, metadata: RunMetadata, report: str | None, table: str | None
+    ) -> None:
+        """metadata: in the output itself; where: name of the output, for errors."""
+        self._where = where
+        known = None if report is None else report_of(where, report)
+        if metadata.sensors is None or metadata.rate is None:
+            if known is None:
+                raise RecordingError(
+                    f"{where}: expected the report of the run, which has rate and sensors, found "
+                    "none; put it back where `convert` wrote it"
+                )
+            metadata = _metadata_of(known)
+        self.metadata = metadata
+        self.sensors = metadata.sensors or ()
+        self._info = RunInfo(
+            _sensors(where, self.sensors, known),
+            "",
+            metadata.rate or "",
+            metadata.timescale or "unknown",
+            1 if metadata.slices is None else metadata.slices,
+            "dense",
+            metadata.sort or "columns",
+            variants=metadata.variants,
+        )
+        self._infos: dict[tuple[str, bool], RunInfo] = {}
+        self._table = None
+        if table is not None:
+            self._table = TableOfRun(read_table(table, f"{where}: scans.csv"), self.sensors)
+        try:
+            self._grid = Grid(parse_rate(self._info.rate_hz), self._info.slices)
+        except UsageError as err:
+            raise RecordingError(f"{where}: {err}; convert again") from err
+        # Number of the first slice.
+        self._first = self._grid.index_of(metadata.t_init_ns or 0)
+        # Messages so far.
         self._read = 0
 
-    def scan(self, topic: str, data: bytes | memoryview, encoding: str) -> Iterator[Scan]:
-        """The scan of a message; none for a forwarded topic."""
-        from mlbatch.outputs.encoding import MessageCursor
-
-        own = {"/points": None} | {
-            f"/{name}/points": number for number, name in enumerate(self._about.sensors)
-        }
-        if topic not in own:
-            return
-        try:
-            cloud = read_cloud(MessageCursor.of_message(data, encoding))
-        except DamageError as err:
-            raise RecordingError(f"{self._about.where}: {topic}: {err}; convert again") from err
-        layout = "dense" if cloud.is_dense else "organized"
-        key = (cloud.frame_id, layout)
-        if key not in self._infos:
-            self._infos[key] = self._about.info(*key)
-        if "batching" in dict(self._about.variants):
-            index, part, start_ns, end_ns = self._set()
-        else:
-            start_ns = self._places.start_of_message(cloud.stamp_ns)
-            index, part, end_ns = self._places.place(start_ns)
-        row = row_of(self._table, index, part, own[topic])
-        if row is None:
-            raise RecordingError(
-                f"{self._about.where}: expected a row of scan {index} slice {part} in scans.csv, "
-                "found none; put scans.csv back, or convert again"
-            )
-        place = CloudPlace(self._infos[key], index, part, start_ns, end_ns, row, own[topic])
-        rows = cloud.records.T if layout == "organized" else cloud.records.reshape(-1)
-        yield scan_of_cloud(place, rows, row.complete)
-
-    def _set(self) -> tuple[int, int, int, int]:
-        """Index, slice, start and end (ns) of the next set of sweeps: a line of scans.csv each."""
+    def window_of_message(self, stamp_ns: int) -> tuple[int, int, int, int]:
+        """Index, slice, start and end (ns) of the next message."""
         number = self._read
         self._read += 1
-        rows = None if self._table is None else self._table.rows
-        if rows is None or number >= len(rows):
+        if self.metadata.batching is None:
+            # The end of a window is the start of the next one.
+            start_ns = self._grid.floor_bound(stamp_ns - (self.metadata.stamp == "end"))
+            return *self._place(start_ns)[:2], start_ns, self._place(start_ns)[2]
+        # Sets of sweeps have a line of scans.csv each.
+        if self._table is None or number >= len(self._table.rows):
             return number, 0, 0, 0
-        row = rows[number]
+        row = self._table.rows[number]
         return int(row["index"]), 0, int(row["start_ns"]), int(row["end_ns"])
 
+    def _place(self, start_ns: int) -> tuple[int, int, int]:
+        """Index, slice and end (ns) of the scan that starts at a time."""
+        number = self._grid.index_of(start_ns)
+        index, part = divmod(number - self._first, self._grid.slices)
+        return index, part, self._grid.bound(number + 1)
 
-# -- a file a scan --------------------------------------------------------------------------------
-
-
-@dataclass(slots=True)
-class _FileRun:
-    """The run of a folder; info: of the first scan."""
-
-    files: RunFiles
-    info: RunInfo | None = None
-    about: RunOfOutput | None = None
-    # Starts of scans without one, by folder and file.
-    starts: dict[Path, dict[Path, int]] = field(default_factory=dict)
-    _table: TableOfRun | None = None
-    _has_table: bool = False
-
-    def shared(self, about: RunOfOutput, frame_id: str, layout: str) -> RunInfo:
-        """What all scans share, made once."""
-        if self.info is None:
-            self.about = about
-            self.info = about.info(frame_id, layout)
-        return self.info
-
-    def row(self, scan: Scan, only: int | None) -> ScanRow | None:
-        """The row of a scan in scans.csv; None if there is none."""
-        if self.about is not None and not self._has_table:
-            self._table = self.about.table()
-            self._has_table = True
-        return row_of(self._table, scan.index, scan.slice, only)
-
-
-def _scans_of_files(folder: Path, suffix: str, files: list[ScanFile]) -> Iterator[Scan]:
-    reader = _FILE_READERS[suffix]
-    run = _FileRun(RunFiles.of(folder))
-    for file in files:
-        try:
-            scan, index = reader(file, run)
-        except DamageError as err:
+    def scan(self, stored: StoredScan, frame_id: str) -> Scan:
+        """A scan as users get it."""
+        if stored.end_ns is None:
+            stored.index, stored.slice, stored.end_ns = self._place(stored.start_ns)
+        place = (stored.index or 0, stored.slice or 0)
+        row = None if self._table is None else self._table.row(*place, stored.sensor)
+        if row is None and stored.complete is None:
             raise RecordingError(
-                f"{file.path}: {err}; see `mlbatch verify`, and convert again"
-            ) from err
-        scan.sensor = file.sensor or ""
-        row = run.row(scan, None if file.sensor is None else index)
-        if row is None and file.suffix in _WITHOUT_HEADER:
-            raise RecordingError(
-                f"{file.path}: expected a row of scan {scan.index} slice {scan.slice} in "
-                "scans.csv, found none; put scans.csv back, or convert again"
+                f"{self._where}: {stored.where}: expected a row of scan {place[0]} slice "
+                f"{place[1]} in scans.csv, found none; put scans.csv back, or convert again"
             )
-        if row is not None:
-            scan.complete = row.complete if file.suffix in _WITHOUT_HEADER else scan.complete
-            scan.columns_per_sensor = row.columns
-            scan.max_gap_ns = row.max_gap_ns
-            scan.coverage = row.coverage
-            scan.overlap = row.overlap
-            scan.fill = np.array(row.fill, np.float32)
-            scan.ready_host_ns = row.ready_host_ns
-        yield scan
-
-
-def _sensor_index(file: ScanFile, names: tuple[str, ...]) -> int | None:
-    """Index of the sensor in whose folder a file is; None without `--split`."""
-    if file.sensor is None:
-        return None
-    if file.sensor not in names:
-        raise DamageError(f"the folder of one of {', '.join(names)}", file.sensor)
-    return names.index(file.sensor)
-
-
-def _npz_scan(file: ScanFile, run: _FileRun) -> tuple[Scan, int | None]:
-    try:
-        values = arrays_of(file)
-        if str(values["schema"]) != _SCHEMA:
-            raise DamageError(f"the schema {_SCHEMA}", str(values["schema"]))
-        names = tuple(map(str, values["sensors"].tolist()))
-        slices = int(values["slices"])
-        rate_hz = str(values["rate_hz"])
-        about = RunOfOutput(
-            str(file.path),
-            names,
-            rate_hz,
-            slices,
-            str(values["timescale"]),
-            None,
-            str(values.get("sort", "columns")),
-            run.files,
-            variants_of(values),
+        arrays = point_arrays(stored)
+        has_columns = stored.column_stamp_ns is not None
+        absent = () if has_columns else (*(_KINDS.keys() - arrays.keys()), *_COLUMN_ARRAYS)
+        owners = _copied(stored.column_lidar_id, "u1")
+        row = row or ScanRow(
+            bool(stored.complete),
+            tuple(np.bincount(owners, minlength=len(self.sensors)).tolist()) if has_columns else (),
+            fill=() if stored.fill is None else tuple(stored.fill.tolist()),
         )
-        layout = "dense" if values["xyz"].ndim == 2 else "organized"
-        info = run.shared(about, str(values["frame_id"]), layout)
-        columns = values["column_lidar_id"]
-        scan = Scan(
-            info=info,
-            index=int(values["index"]),
-            slice=int(values["slice"]),
-            start_ns=int(values["start_ns"]),
-            end_ns=int(values["end_ns"]),
-            complete=bool(values["complete"]),
-            ready_host_ns=0,
-            xyz=values["xyz"],
-            intensity=values["intensity"],
-            reflectivity=values.get("reflectivity"),
-            range_m=values["range_m"],
-            time_ns=values["time_ns"],
-            ring=values["ring"],
-            return_type=values["return_type"],
-            lidar_id=values["lidar_id"],
-            column=values.get("column"),
-            column_stamp_ns=values["column_stamp_ns"],
-            column_lidar_id=columns,
-            columns_per_sensor=tuple(np.bincount(columns, minlength=len(names)).tolist()),
-            max_gap_ns=(),
-            fill=values.get("fill", np.zeros(0, np.float32)),
-            absent=frozenset({"ring_base"}),
+        return Scan(
+            info=self._info_of(frame_id, stored.organized),
+            index=place[0],
+            slice=place[1],
+            start_ns=stored.start_ns,
+            end_ns=stored.end_ns,
+            complete=row.complete if stored.complete is None else stored.complete,
+            ready_host_ns=row.ready_host_ns,
+            xyz=_copied(stored.xyz, "<f4"),
+            intensity=arrays.get("intensity", np.zeros(0, np.float32)),
+            reflectivity=arrays.get("reflectivity"),
+            range_m=arrays.get("range_m"),
+            time_ns=arrays.get("time_ns", np.zeros(0, np.uint32)),
+            ring=arrays.get("ring", np.zeros(0, np.uint16)),
+            return_type=arrays.get("return_type", np.zeros(0, np.uint8)),
+            lidar_id=arrays.get("lidar_id", np.zeros(0, np.uint8)),
+            column=None if stored.column is None else _copied(stored.column, "<u4"),
+            column_stamp_ns=_copied(stored.column_stamp_ns, "<i8"),
+            column_lidar_id=owners,
+            columns_per_sensor=row.columns,
+            max_gap_ns=row.max_gap_ns,
+            coverage=row.coverage,
+            overlap=row.overlap,
+            fill=np.array(row.fill, np.float32),
+            absent=frozenset({*absent, "ring_base"}),
+            sensor="" if stored.sensor is None else self.sensors[stored.sensor],
         )
-    except (KeyError, TypeError, ValueError) as err:
-        raise DamageError("the keys of docs/formats.md", f"{type(err).__name__}: {err}") from err
-    return scan, _sensor_index(file, names)
+
+    def _info_of(self, frame_id: str, organized: bool) -> RunInfo:
+        """What all scans share, made once."""
+        key = (frame_id, organized)
+        if key not in self._infos:
+            layout = "organized" if organized else "dense"
+            self._infos[key] = self._info._replace(frame_id=frame_id, layout=layout)
+        return self._infos[key]
 
 
-def _commented_scan(file: ScanFile, run: _FileRun) -> tuple[Scan, int | None]:
-    """A scan of a format that has its metadata in comments: PLY, PCD, LAS."""
-    log = CheckLog()
-    reader = _COMMENTED[file.suffix](log)
-    comments, points = reader.parse(file.read())
-    _refuse_damage(log, file.path)
-    metadata = comments.metadata()
-    index, part, slices = comments.place()
-    names = metadata.sensors
-    if names is None or metadata.rate is None or metadata.timescale is None:
-        raise DamageError("the comments of docs/formats.md", "no rate, timescale or sensors")
-    about = RunOfOutput(
-        str(file.path),
-        names,
-        metadata.rate,
-        slices,
-        metadata.timescale,
-        None,
-        metadata.sort or "columns",
-        run.files,
-        variants_of(comments.by_name),
+def point_arrays(stored: StoredScan) -> dict[str, Array]:
+    """The point arrays that a scan has, each of its own memory."""
+    found: dict[str, Array | None] = {name: getattr(stored, name) for name in _KINDS}
+    if found["intensity"] is None:
+        found["intensity"] = stored.byte_intensity
+    if stored.time_s is not None:
+        # The product of a float32 and 10^9 has fewer bits than a float64: the smallest ns that
+        # gives it, since float32 are rounded toward zero.
+        time_ns = stored.time_s.astype(np.float64) * NS_PER_S
+        found["time_ns"] = np.ceil(time_ns) if stored.time_s.itemsize == 4 else np.rint(time_ns)
+    if found["time_ns"] is not None:
+        found["time_ns"] = np.maximum(found["time_ns"], 0)
+    if stored.sensor is not None and found["lidar_id"] is None:
+        # All points are of this sensor, whether the layout has a field for it or not.
+        found["lidar_id"] = np.full(stored.xyz.shape[:-1], stored.sensor, np.uint8)
+    return {name: _copied(one, _KINDS[name]) for name, one in found.items() if one is not None}
+
+
+def _copied(values: Array | None, kind: str) -> Array:
+    return np.zeros(0, kind) if values is None else np.array(values, kind, order="C")
+
+
+def _metadata_of(report: RunReport) -> RunMetadata:
+    """The constants of a run in its report."""
+    return RunMetadata(
+        rate=report.rate_hz,
+        slices=report.slices,
+        t_init_ns=report.t_init_ns,
+        sensors=tuple(sensor.name for sensor in report.sensors),
+        timescale=report.timescale,
+        sort=report.sort or None,
+        **dict(report.variants),
     )
-    layout = "organized" if points.organized else "dense"
-    info = run.shared(about, metadata.frame_id or "", layout)
-    start_ns = comments.number("start_ns")
-    only = _sensor_index(file, names)
-    end_ns = comments.number("end_ns")
-    place = CloudPlace(info, index, part, start_ns, end_ns, None, only)
-    fields = {
-        "intensity": points.intensity,
-        "reflectivity": points.reflectivity,
-        "time": points.time_s,
-        "t": points.time_ns,
-        "ring": points.ring,
-        "return_type": points.return_type,
-        "lidar_id": points.lidar_id,
-    }
-    stored = {name: values for name, values in fields.items() if values is not None}
-    scan = scan_of_fields(place, points.xyz, stored, comments.is_complete())
-    return scan, only
 
 
-def _rows_scan(file: ScanFile, run: _FileRun) -> tuple[Scan, int | None]:
-    """A scan of kitti or nuscenes: all but the points is in report and scans.csv."""
-    found = read_rows(file)
-    about = run.about or run.files.about()
-    info = run.shared(about, "", "dense")
-    start_ns = start_of(file, run.starts)
-    index, part, end_ns = about.places().place(start_ns)
-    only = _sensor_index(file, about.sensors)
-    place = CloudPlace(info, index, part, start_ns, end_ns, None, only)
-    fields: dict[str, Values] = {"intensity": found.rows[:, 3]}
-    if found.times is not None:
-        fields |= {
-            "ring": found.rows[:, 4],
-            "time": found.times[:, 0],
-            "lidar_id": found.times[:, 1],
-        }
-    # `complete` is in scans.csv.
-    return scan_of_fields(place, found.rows[:, :3], fields, False), only
+def _sensors(
+    where: str, names: tuple[str, ...], report: RunReport | None
+) -> tuple[SensorInfo, ...]:
+    """The sensors; without a report their models are unknown, and their poses NaN.
 
-
-_COMMENTED: dict[str, Callable[[CheckLog], CommentedReader]] = {
-    ".ply": PlyReader,
-    ".pcd": PcdReader,
-    ".las": LasReader,
-    ".laz": LasReader,
-}
-# By the suffix of the first file of a scan; that of kitti is the end of that of nuscenes.
-_FILE_READERS: dict[str, Callable[[ScanFile, _FileRun], tuple[Scan, int | None]]] = {
-    ".npz": _npz_scan,
-    **dict.fromkeys(_COMMENTED, _commented_scan),
-    NUSCENES_SUFFIX: _rows_scan,
-    KITTI_SUFFIX: _rows_scan,
-}
+    Channels and ring numbers are 0: outputs do not have them.
+    """
+    known = {} if report is None else {sensor.name: sensor for sensor in report.sensors}
+    found = []
+    for name in names:
+        model, pose = "", np.full((4, 4), np.nan)
+        if name in known:
+            model, pose = known[name].model, known[name].body_from_sensor
+            if pose.shape != (4, 4):
+                raise RecordingError(
+                    f"{where}: expected a pose (4, 4) of {name} in the report, found a damaged "
+                    "one; restore it, or convert again"
+                )
+        found.append(SensorInfo(name, model, 0, 0, 0, pose))
+    return tuple(found)

@@ -4,11 +4,29 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
+
 from mlbatch.arrays import BoolArray, F32Array, F64Array, I64Array, U8Array, U16Array, U32Array
 
 # Longest time from the stamp of a column to its last firing, with room: the longest of the
 # supported lidars is 0.14 ms (PandarQT64).
 COLUMN_NS = 1_000_000
+
+
+_NS = 10**9
+# Of damaged times, before they are converted.
+_MOST_S = 4.0
+
+
+def seconds_to_ns(time_s: F32Array | F64Array) -> tuple[I64Array, int]:
+    """Times as stored, s, in ns, and their largest error; float32 are rounded toward zero."""
+    # Before the conversion, which warns of signalling NaN.
+    exact: F64Array = np.clip(np.nan_to_num(time_s).astype(np.float64), -_MOST_S, _MOST_S)
+    if time_s.dtype.itemsize > np.dtype("f4").itemsize:
+        return np.rint(exact * _NS).astype(np.int64), 0
+    # Never later than the true time.
+    step_s = float(np.spacing(np.float32(np.abs(exact).max(initial=0))))
+    return np.floor(exact * _NS).astype(np.int64), int(step_s * _NS) + 1
 
 
 @dataclass(slots=True)
@@ -30,6 +48,7 @@ class StoredScan:
     slice: int | None = None
     complete: bool | None = None
     intensity: F32Array | None = None
+    reflectivity: U16Array | None = None
     # Instead of `intensity` in layouts that store 8 bits of it.
     byte_intensity: U8Array | None = None
     range_m: F32Array | F64Array | None = None
@@ -41,6 +60,8 @@ class StoredScan:
     time_ns: I64Array | None = None
     # Resolution of `time_ns`.
     time_step_ns: int = 0
+    # The times as stored, if they are s after `start_ns`.
+    time_s: F32Array | F64Array | None = None
     ring: U16Array | I64Array | None = None
     return_type: U8Array | None = None
     lidar_id: U8Array | None = None

@@ -14,8 +14,9 @@ from mlbatch.outputs.containers import BoundedFile, Message, library_errors
 from mlbatch.outputs.damage import CheckLog, DamageError, VerifyError
 from mlbatch.outputs.encoding import MessageCursor
 from mlbatch.outputs.file_formats import FileFormat
-from mlbatch.outputs.folders import entries, scan_files
+from mlbatch.outputs.folders import scan_files
 from mlbatch.outputs.kinds import kind_of
+from mlbatch.outputs.run_files import mcaps_of
 from mlbatch.outputs.stored_scan import StoredScan
 from mlbatch.page.windows import Windows
 from mlbatch.units import NS_PER_S
@@ -101,14 +102,6 @@ def read_clouds(output: Path, places: list[Place], sensors: tuple[str, ...]) -> 
 
 
 # -- containers -------------------------------------------------------------------------------
-
-
-def mcaps_of(path: Path) -> list[Path]:
-    """The MCAP files of an output: itself, or those in a bag folder; none in other outputs."""
-    kind = kind_of(path).name
-    if kind == "rosbag2":
-        return [entry for entry in entries(path) if entry.suffix == ".mcap"]
-    return [path] if kind == "mcap" else []
 
 
 def _scans(output: Path, places: list[Place], sensors: tuple[str, ...]) -> Iterator[StoredScan]:

@@ -10,7 +10,7 @@ import base64
 import hashlib
 import json
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from html import escape
 from importlib import resources
 from pathlib import PurePath
@@ -25,8 +25,9 @@ from mlbatch.outputs.damage import VerifyError
 from mlbatch.page.clouds import PageCloud, choose_places, read_clouds, window_ms
 from mlbatch.page.findings import Finding, Level, findings, number, percent, verdict
 from mlbatch.page.source import Source
-from mlbatch.page.values import Values
 from mlbatch.page.windows import Windows, read_windows, summarise
+from mlbatch.report.ledger import SensorLedger
+from mlbatch.report.report import RunReport, SensorReport
 
 _WORDS = {
     Level.GOOD: ("good", "OK"),
@@ -60,6 +61,9 @@ _MEANINGS = {
     "bad_stamp": "bad timestamp",
     "duplicate": "duplicate",
 }
+# Outcomes of points, and costs of a run, in the order of the page.
+_OUTCOMES = ("written", "no_return", "range", "box", "repeated")
+_COSTS = ("wall_s", "cpu_s", "read_s", "decode_s", "merge_s", "write_s", "peak_rss_mb")
 _NO_TABLE = (
     "No scans.csv was found, so nothing is known of single windows: give the output "
     "(<code>mlbatch report OUTPUT</code>), or keep scans.csv next to it."
@@ -70,7 +74,7 @@ _NO_SCANS = "The scans are not available to this page: give the output itself."
 def page_text(source: Source) -> str:
     """The whole page. Raises ExportError if scans.csv is damaged."""
     report = source.report
-    slices = report.count("grid", "slices")
+    slices = report.slices
     windows = None if source.table is None else read_windows(source.table, slices)
     clouds, why_no_clouds = _clouds(source, windows)
     found = findings(report, windows)
@@ -100,7 +104,7 @@ def page_text(source: Source) -> str:
 style-src 'unsafe-inline'; script-src 'sha256-{digest}'">
 <meta name="viewport" content="width=device-width, initial-scale=1">
 <meta name="color-scheme" content="light dark">
-<meta name="generator" content="mlbatch {escape(report.text("version"))}">
+<meta name="generator" content="mlbatch {escape(report.version)}">
 <link rel="icon" href="data:,">
 <title>{escape(title)} - mlbatch</title>
 <style>
@@ -134,7 +138,7 @@ def _json(value: object) -> str:
 def _title(source: Source) -> str:
     if source.output is not None:
         return source.output.name or str(source.output)
-    inputs = [PurePath(one.text("path")).name for one in source.report.items("inputs")]
+    inputs = [PurePath(one.path).name for one in source.report.inputs]
     return ", ".join(filter(None, inputs)) or "run"
 
 
@@ -163,17 +167,16 @@ def _header(source: Source, title: str, found: list[Finding], windows: Windows |
     level, heading, others = verdict(found)
     word, label = _WORDS[level]
     report = source.report
-    sensors = report.items("sensors")
-    written = report.at("scans").count("written")
-    names = ", ".join(sensor.text("name") for sensor in sensors)
-    rate = report.text("grid", "rate_hz")
+    sensors = report.sensors
+    written = report.scans.written
+    names = ", ".join(sensor.name for sensor in sensors)
+    rate = report.rate_hz
     summary = f"{number(written, 'scan')} at {rate} Hz of {number(len(sensors), 'lidar')} ({names})"
-    recorded_s = report.number("timing", "recorded_s")
-    if recorded_s:
-        summary += f", from {_seconds(recorded_s)} of recording"
+    if report.recorded_s:
+        summary += f", from {_seconds(report.recorded_s)} of recording"
     summary += f". {_loss_words(sensors)}"
     if windows is not None:
-        start = describe_time(int(windows.start_ns[0]), report.text("timescale"))
+        start = describe_time(int(windows.start_ns[0]), report.timescale)
         summary += f" First scan at {start}."
     return (
         f"<header>\n<h1>{escape(title)}</h1>\n"
@@ -183,9 +186,9 @@ def _header(source: Source, title: str, found: list[Finding], windows: Windows |
     )
 
 
-def _loss_words(sensors: Sequence[Values]) -> str:
-    lost = sum(sensor.count("packets", "lost") for sensor in sensors)
-    read = sum(sensor.count("packets", "read") for sensor in sensors)
+def _loss_words(sensors: Sequence[SensorReport]) -> str:
+    lost = sum(sensor.ledger.packets.lost for sensor in sensors)
+    read = sum(sensor.ledger.packets.read for sensor in sensors)
     if not lost:
         return f"None of {number(read, 'packet')} was lost."
     return f"{number(lost, 'packet')} lost ({percent(lost, read + lost)})."
@@ -200,23 +203,21 @@ def _seconds(seconds: float) -> str:
     return f"{minutes // 60} h {minutes % 60} min"
 
 
-def _cards(report: Values) -> str:
-    scans = report.at("scans")
-    sensors = report.items("sensors")
-    span = scans.number("span_ms", "p50")
-    timing = report.at("timing")
+def _cards(report: RunReport) -> str:
+    scans = report.scans
+    sensors = report.sensors
+    span = scans.span_ms.p50
+    timing = report.timing
+    packets = [sensor.ledger.packets for sensor in sensors]
     cards = [
-        ("scans", f"{scans.count('written'):,}"),
-        ("incomplete", f"{scans.count('incomplete'):,}"),
-        ("points", _short(scans.count("points"))),
-        ("lost packets", f"{sum(one.count('packets', 'lost') for one in sensors):,}"),
-        (
-            "rejected packets",
-            f"{sum(sum(one.counts('packets', 'rejected').values()) for one in sensors):,}",
-        ),
+        ("scans", f"{scans.written:,}"),
+        ("incomplete", f"{scans.incomplete:,}"),
+        ("points", _short(scans.points)),
+        ("lost packets", f"{sum(one.lost for one in packets):,}"),
+        ("rejected packets", f"{sum(sum(one.rejected.values()) for one in packets):,}"),
         ("set span, median", "" if span is None else f"{span:.1f} ms"),
-        ("clock", report.text("timescale")),
-        ("times real time", _factor(timing.number("realtime_factor"))),
+        ("clock", report.timescale),
+        ("times real time", "" if timing is None else f"{timing.realtime_factor:.1f}"),
     ]
     items = "".join(
         f"<div class='card'><b>{escape(value)}</b><span>{escape(name)}</span></div>"
@@ -224,10 +225,6 @@ def _cards(report: Values) -> str:
         if value
     )
     return f"<div class='cards'>{items}</div>"
-
-
-def _factor(factor: float | None) -> str:
-    return "" if factor is None else f"{factor:.1f}"
 
 
 def _short(count: int) -> str:
@@ -342,31 +339,20 @@ def _caption(cloud: PageCloud) -> str:
     )
 
 
-def _accounts(report: Values) -> str:
-    rows = []
-    for title, total, key, parts in (
-        ("Packets", "accepted", "packets", ("rejected",)),
-        ("Columns", "written", "columns", ("dropped",)),
-    ):
-        for sensor in report.items("sensors"):
-            counts = {total: sensor.count(key, total)}
-            for part in parts:
-                counts |= sensor.counts(key, part)
-            if key == "packets":
-                counts["lost"] = sensor.count("packets", "lost")
-            rows.append((title, sensor.text("name"), counts))
-    outcomes = ("written", "no_return", "range", "box", "repeated")
-    rows += [
-        ("Points", sensor.text("name"), {key: sensor.count("points", key) for key in outcomes})
-        for sensor in report.items("sensors")
-    ]
+def _accounts(report: RunReport) -> str:
+    accounts: dict[str, Callable[[SensorLedger], dict[str, int]]] = {
+        "Packets": lambda one: {
+            "accepted": one.packets.accepted,
+            **one.packets.rejected,
+            "lost": one.packets.lost,
+        },
+        "Columns": lambda one: {"written": one.columns.written, **one.columns.dropped},
+        "Points": lambda one: {name: getattr(one.points, name) for name in _OUTCOMES},
+    }
     lines = []
-    last = ""
-    for title, name, counts in rows:
-        if title != last:
-            lines.append(f"<h3>{title}</h3>")
-            last = title
-        lines.append(_bar(name, counts))
+    for title, counts in accounts.items() if report.sensors else ():
+        lines.append(f"<h3>{title}</h3>")
+        lines += [_bar(sensor.name, counts(sensor.ledger)) for sensor in report.sensors]
     about = "Every packet, column and point by outcome; the accounts of the report balance."
     return _section("Accounts", "".join(lines), about)
 
@@ -397,29 +383,28 @@ def _bar(name: str, counts: dict[str, int]) -> str:
     )
 
 
-def _clock(report: Values) -> str:
+def _clock(report: RunReport) -> str:
     rows = []
     has_drift = False
-    for sensor in report.items("sensors"):
-        clock = sensor.at("clock")
-        offset = clock.number("offset_to_host_ms")
-        drift = clock.number("drift_ppm")
+    for sensor in report.sensors:
+        clock = sensor.clock
+        offset = clock.offset_to_host_ms
+        drift = clock.drift_ppm
         has_drift |= drift is not None
-        notes = "; ".join(one.text() for one in clock.items("notes"))
         cells = (
-            sensor.text("name"),
-            clock.text("source"),
-            clock.text("epoch"),
+            sensor.name,
+            clock.source,
+            clock.epoch,
             "" if offset is None else _offset(offset),
             "not determined" if drift is None else f"{drift:+.2f} ppm",
             "" if drift is None else f"{drift * 3.6:+.1f} ms/h",
-            notes,
+            "; ".join(clock.notes),
         )
         rows.append(cells)
     head = ("sensor", "stamps from", "epoch", "offset to host", "drift", "", "notes")
     plot = (
         "<h3>Offset since the start, by the fitted drift, ms</h3><canvas id='drift'></canvas>"
-        if has_drift and report.number("timing", "recorded_s")
+        if has_drift and report.recorded_s
         else "<p class='lacks'>No drift was determined: the recording is too short, or stamps are "
         "receive times.</p>"
     )
@@ -436,43 +421,38 @@ def _offset(offset_ms: float) -> str:
     return f"{offset_ms:.3f} ms"
 
 
-def _sensors(report: Values) -> str:
+def _sensors(report: RunReport) -> str:
     head = (
         *("sensor", "model", "stream", "mode", "packets", "lost", "rejected", "columns", "points"),
         *("position, m", "roll, pitch, yaw", "extrinsics from", "calibration"),
     )
     rows = []
-    for sensor in report.items("sensors"):
+    for sensor in report.sensors:
         position, angles = _pose_words(sensor)
         rows.append(
             (
-                *(sensor.text(key) for key in ("name", "model", "stream", "mode")),
-                f"{sensor.count('packets', 'read'):,}",
-                f"{sensor.count('packets', 'lost'):,}",
-                f"{sum(sensor.counts('packets', 'rejected').values()):,}",
-                f"{sensor.count('columns', 'written'):,}",
-                f"{sensor.count('points', 'written'):,}",
+                *(sensor.name, sensor.model, sensor.stream, sensor.mode),
+                f"{sensor.ledger.packets.read:,}",
+                f"{sensor.ledger.packets.lost:,}",
+                f"{sum(sensor.ledger.packets.rejected.values()):,}",
+                f"{sensor.ledger.columns.written:,}",
+                f"{sensor.ledger.points.written:,}",
                 position,
                 angles,
-                sensor.text("extrinsics", "source"),
-                "; ".join(filter(None, map(sensor.text, ("calibration", "calibration_note")))),
+                sensor.extrinsics_source,
+                "; ".join(filter(None, (sensor.calibration, sensor.calibration_note))),
             )
         )
     return _section("Sensors", _table(head, rows))
 
 
-def _pose(sensor: Values) -> F64Array | None:
+def _pose(sensor: SensorReport) -> F64Array | None:
     """`body_from_sensor` (4, 4); None if absent or damaged."""
-    rows = [
-        [cell.number() for cell in row.items()]
-        for row in sensor.items("extrinsics", "body_from_sensor")
-    ]
-    if len(rows) != 4 or any(len(row) != 4 or None in row for row in rows):
-        return None
-    return np.array(rows, dtype=np.float64)
+    pose = sensor.body_from_sensor
+    return pose if pose.shape == (4, 4) and np.isfinite(pose).all() else None
 
 
-def _pose_words(sensor: Values) -> tuple[str, str]:
+def _pose_words(sensor: SensorReport) -> tuple[str, str]:
     pose = _pose(sensor)
     if pose is None:
         return "", ""
@@ -485,31 +465,19 @@ def _pose_words(sensor: Values) -> tuple[str, str]:
     return position, f"{angles} deg"
 
 
-def _about(report: Values) -> str:
-    command = report.text("command")
+def _about(report: RunReport) -> str:
+    command = report.command
     shown = (
         f"<pre id='command'>{escape(command)}</pre>"
         if command
         else "<p class='lacks'>The report has no command line.</p>"
     )
-    inputs = [
-        (one.text("path"), one.text("container"), f"{one.count('bytes') / 1e6:,.1f} MB")
-        for one in report.items("inputs")
-    ]
-    timing = report.at("timing")
-    costs = [
-        (key, f"{value:.2f}")
-        for key in ("wall_s", "cpu_s", "read_s", "decode_s", "merge_s", "write_s", "peak_rss_mb")
-        if (value := timing.number(key)) is not None
-    ]
-    topics = [
-        (one.text("topic"), f"{one.count('read'):,}", f"{one.count('written'):,}")
-        for one in report.items("messages")
-    ]
-    unassigned = [
-        (one.text("stream"), f"{one.count('packets'):,}", one.text("what"))
-        for one in report.items("unassigned")
-    ]
+    inputs = [(one.path, one.container, f"{one.bytes / 1e6:,.1f} MB") for one in report.inputs]
+    costs = (
+        [] if report.timing is None else [f"{getattr(report.timing, key):.2f}" for key in _COSTS]
+    )
+    topics = [(one.topic, f"{one.read:,}", f"{one.written:,}") for one in report.messages]
+    unassigned = [(one.stream, f"{one.packets:,}", one.what) for one in report.unassigned]
     parts = [shown, "<h3>Inputs</h3>", _table(("path", "container", "size"), inputs)]
     if unassigned:
         parts += ["<h3>Packets of no sensor</h3>"]
@@ -517,12 +485,11 @@ def _about(report: Values) -> str:
     if topics:
         parts += ["<h3>Forwarded topics</h3>", _table(("topic", "read", "written"), topics)]
     if costs:
-        names = tuple(name for name, _ in costs)
-        parts += ["<h3>Costs</h3>", _table(names, [tuple(value for _, value in costs)])]
+        parts += ["<h3>Costs</h3>", _table(_COSTS, [costs])]
     parts.append(
         "<p class='lacks'>Against frame-level fusion: not part of a conversion; "
         "<code>mlbatch compare RECORDING</code> computes it.</p>"
-        f"<p class='lacks'>mlbatch {escape(report.text('version'))}</p>"
+        f"<p class='lacks'>mlbatch {escape(report.version)}</p>"
     )
     return _section("Command and inputs", "".join(parts))
 
@@ -539,12 +506,14 @@ def _table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
 # -- data of the plots ------------------------------------------------------------------------
 
 
-def _plot_data(report: Values, windows: Windows | None, clouds: list[PageCloud]) -> dict[str, Any]:
-    sensors = report.items("sensors")
+def _plot_data(
+    report: RunReport, windows: Windows | None, clouds: list[PageCloud]
+) -> dict[str, Any]:
+    sensors = report.sensors
     data: dict[str, Any] = {
-        "sensors": [sensor.text("name") for sensor in sensors],
-        "recorded_s": report.number("timing", "recorded_s"),
-        "drift_ppm": [sensor.number("clock", "drift_ppm") for sensor in sensors],
+        "sensors": [sensor.name for sensor in sensors],
+        "recorded_s": report.recorded_s or None,
+        "drift_ppm": [sensor.clock.drift_ppm for sensor in sensors],
         "poses": [
             None if (pose := _pose(sensor)) is None else pose[:3].ravel().tolist()
             for sensor in sensors

@@ -9,8 +9,8 @@ from enum import IntEnum
 import numpy as np
 
 from mlbatch.arrays import BoolArray
-from mlbatch.page.values import Values
 from mlbatch.page.windows import Windows
+from mlbatch.report.report import RunReport
 
 _NETWORK = (
     "check network, switch and capture buffers (tcpdump -B, net.core.rmem_max), and the speed of "
@@ -91,7 +91,7 @@ class Finding:
     code: str = ""
 
 
-def findings(report: Values, windows: Windows | None) -> list[Finding]:
+def findings(report: RunReport, windows: Windows | None) -> list[Finding]:
     """All findings, the most serious first."""
     found = [
         *_scans(report, windows),
@@ -130,22 +130,22 @@ def number(count: int, one: str, many: str = "") -> str:
     return f"{count:,} {one if count == 1 else many or one + 's'}"
 
 
-def _scans(report: Values, windows: Windows | None) -> Iterator[Finding]:
-    scans = report.at("scans")
-    written = scans.count("written")
+def _scans(report: RunReport, windows: Windows | None) -> Iterator[Finding]:
+    scans = report.scans
+    written = scans.written
     if not written:
         yield Finding(
             Level.PROBLEM,
             "No scan was written.",
             "see the error of mlbatch convert; mlbatch inspect shows what the recording contains",
         )
-    if empty := scans.count("empty"):
+    if empty := scans.empty:
         yield Finding(
             Level.WARNING,
             f"{number(empty, 'window')} without a column of any sensor: no scan was written.",
             "look for a pause of the capture; the indices of scans keep the gap",
         )
-    incomplete = scans.count("incomplete")
+    incomplete = scans.incomplete
     if windows is not None and windows.has_head:
         yield Finding(Level.NOTE, "Head and tail are incomplete, as requested by --keep-partial.")
         partial = 1 + int(not windows.complete[-1])
@@ -163,7 +163,7 @@ def _scans(report: Values, windows: Windows | None) -> Iterator[Finding]:
             f"{'is' if incomplete == 1 else 'are'} incomplete: a sensor does not cover the window.",
             "skip scans with complete = false, or leave them out with --drop-incomplete",
         )
-    if dropped := scans.count("dropped_incomplete"):
+    if dropped := scans.dropped_incomplete:
         yield Finding(
             Level.NOTE, f"{number(dropped, 'scan')} left out, as requested by --drop-incomplete."
         )
@@ -209,22 +209,20 @@ def _intervals(mask: BoolArray) -> list[tuple[int, int]]:
     return [(int(first), int(end)) for first, end in edges.reshape(-1, 2)]
 
 
-def _packets(report: Values) -> Iterator[Finding]:
-    warned = {one.text("sensor") for one in report.items("warnings") if one.text("code") == "loss"}
-    for sensor in report.items("sensors"):
-        name = sensor.text("name")
-        packets = sensor.at("packets")
-        lost = packets.count("lost")
-        sent = packets.count("read") + lost
+def _packets(report: RunReport) -> Iterator[Finding]:
+    warned = {one.sensor for one in report.warnings if one.code == "loss"}
+    for sensor in report.sensors:
+        name = sensor.name
+        packets = sensor.ledger.packets
+        lost = packets.lost
+        sent = packets.read + lost
         # Else the warning states it.
         if lost and name not in warned:
             level = _level(lost, sent)
             text = f"{name} lost {number(lost, 'packet')} of {sent:,}, {percent(lost, sent)}."
             yield Finding(level, text, _NETWORK)
         rejected = {
-            reason: count
-            for reason, count in packets.counts("rejected").items()
-            if reason != "duplicate"
+            reason: count for reason, count in packets.rejected.items() if reason != "duplicate"
         }
         total = sum(rejected.values())
         if total:
@@ -239,23 +237,23 @@ def _level(part: int, whole: int) -> Level:
     return Level.WARNING if part >= _LITTLE * whole else Level.NOTE
 
 
-def _columns(report: Values) -> Iterator[Finding]:
-    for sensor in report.items("sensors"):
-        late = sensor.at("columns").counts("dropped").get("late", 0)
-        decoded = sensor.count("columns", "decoded")
+def _columns(report: RunReport) -> Iterator[Finding]:
+    for sensor in report.sensors:
+        late = sensor.ledger.columns.dropped.get("late", 0)
+        decoded = sensor.ledger.columns.decoded
         if late and late < _MUCH * decoded:
-            text = f"{number(late, 'column')} of {sensor.text('name')} came late and were dropped."
+            text = f"{number(late, 'column')} of {sensor.name} came late and were dropped."
             yield Finding(Level.NOTE, text, REMEDIES["late"])
 
 
-def _clocks(report: Values) -> Iterator[Finding]:
-    recorded_s = report.number("timing", "recorded_s")
+def _clocks(report: RunReport) -> Iterator[Finding]:
+    recorded_s = report.recorded_s
     drifts = {
-        sensor.text("name"): drift
-        for sensor in report.items("sensors")
-        if (drift := sensor.number("clock", "drift_ppm")) is not None
+        sensor.name: sensor.clock.drift_ppm
+        for sensor in report.sensors
+        if sensor.clock.drift_ppm is not None
     }
-    if len(drifts) < 2 or recorded_s is None:
+    if len(drifts) < 2:
         return
     slow = min(drifts, key=drifts.__getitem__)
     fast = max(drifts, key=drifts.__getitem__)
@@ -271,34 +269,28 @@ def _clocks(report: Values) -> Iterator[Finding]:
     yield Finding(level, text, REMEDIES["clocks"])
 
 
-def _faults(report: Values) -> Iterator[Finding]:
-    faults = report.items("faults")
-    if faults:
-        texts = ", ".join(
-            f"{one.text('fault')} ({number(one.count('packets'), 'packet')})" for one in faults
-        )
+def _faults(report: RunReport) -> Iterator[Finding]:
+    if report.faults:
+        texts = ", ".join(f"{one.fault} ({number(one.packets, 'packet')})" for one in report.faults)
         yield Finding(Level.NOTE, f"Faults were injected by --fault: {texts}.")
 
 
-def _warnings(report: Values) -> Iterator[Finding]:
+def _warnings(report: RunReport) -> Iterator[Finding]:
     losses = {
-        sensor.text("name"): _level(
-            sensor.count("packets", "lost"),
-            sensor.count("packets", "lost") + sensor.count("packets", "read"),
-        )
-        for sensor in report.items("sensors")
-        if sensor.count("packets", "lost")
+        sensor.name: _level(packets.lost, packets.lost + packets.read)
+        for sensor in report.sensors
+        if (packets := sensor.ledger.packets).lost
     }
-    for one in report.items("warnings"):
-        code = one.text("code")
+    for one in report.warnings:
+        code = one.code
         level = Level.WARNING
         # Other notes on a calibration say what was assumed, and contradict nothing.
-        is_note = code == "calibration" and "expected" not in one.text("message")
+        is_note = code == "calibration" and "expected" not in one.message
         if code in _INFORMATION or is_note:
             level = Level.NOTE
         elif code in _SERIOUS:
             level = Level.PROBLEM
         elif code == "loss":
-            level = max(level, losses.get(one.text("sensor"), level))
+            level = max(level, losses.get(one.sensor, level))
         remedy = REMEDIES.get(code, "see docs/report.md")
-        yield Finding(level, one.text("message"), remedy, code)
+        yield Finding(level, one.message, remedy, code)

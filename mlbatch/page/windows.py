@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import csv
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from mlbatch.arrays import BoolArray, F64Array, I64Array, median
 from mlbatch.errors import ExportError
+from mlbatch.outputs.table import Cells, TableError
 from mlbatch.units import NS_PER_MS
 
 # Values (windows x sensors) of a page; longer runs are summarised, several windows a value.
@@ -86,54 +85,51 @@ class Windows:
 
 
 def read_windows(text: str, slices: int) -> Windows | None:
-    """Parse scans.csv; None without a row. Raises ExportError."""
-    try:
-        lines = list(csv.reader(text.splitlines()))
-    except csv.Error as err:
-        raise ExportError(f"scans.csv: expected a table, found {err}; convert again") from err
-    if len(lines) < 2:
+    """Read scans.csv; None without a row. Raises ExportError."""
+    if len(text.splitlines()) < 2:
         return None
-    head = lines[0]
-    if any(len(line) != len(head) for line in lines):
-        raise ExportError(
-            f"scans.csv: expected {len(head)} cells in every line, found others; convert again"
-        )
-    cells = dict(zip(head, zip(*lines[1:], strict=True), strict=True))
-    names = tuple(name.removeprefix("columns_") for name in head if name.startswith("columns_"))
     try:
-        return _windows(cells, names, max(1, slices))
-    except (KeyError, ValueError, OverflowError) as err:
+        return _windows(Cells.of(text), max(1, slices))
+    except TableError as err:
+        raise ExportError(f"{err.at('scans.csv')}: {err}; convert again") from err
+    except OverflowError as err:
         raise ExportError(
-            f"scans.csv: expected the columns of docs/formats.md, found {type(err).__name__}: "
-            f"{err}; convert again"
+            f"scans.csv: expected up to {_LARGEST} slices, found {slices}; convert again"
         ) from err
 
 
-def _windows(cells: dict[str, tuple[str, ...]], names: tuple[str, ...], slices: int) -> Windows:
-    rows = len(cells["index"])
-    index = _whole(cells["index"])
-    part = _whole(cells["slice"])
-    start_ns = _whole(cells["start_ns"])
-    end_ns = _whole(cells["end_ns"])
-    columns = np.zeros((rows, len(names)), dtype=np.int64)
-    gap_ms = np.zeros((rows, len(names)))
-    expected = np.zeros((rows, len(names)), dtype=np.int64)
-    estimated = np.zeros(len(names), dtype=bool)
-    for i, name in enumerate(names):
-        columns[:, i] = _whole(cells[f"columns_{name}"])
-        gap_ms[:, i] = _numbers(cells[f"max_gap_ns_{name}"]) / NS_PER_MS
-        missing = cells.get(f"missing_{name}", ("",) * rows)
-        # Unknown: NaN, or empty in outputs of earlier versions.
-        if all(cell not in ("", "NaN") for cell in missing):
-            expected[:, i] = columns[:, i] + _whole(missing)
-        else:
-            present = columns[columns[:, i] > 0, i]
-            # The head and the tail are shorter; most windows are whole.
-            expected[:, i] = 0 if not len(present) else int(median(present))
-            estimated[i] = True
+def _windows(cells: Cells, slices: int) -> Windows:
+    names = cells.sensors
+
+    def whole(name: str, empty: int | None = None) -> I64Array:
+        """A column of integers that may be added."""
+        values = cells.integers(name, empty)
+        if (np.abs(values) > _LARGEST).any():
+            raise TableError(name, f"numbers up to {_LARGEST}", "larger ones")
+        return values
+
+    def reals(name: str) -> F64Array:
+        """A column of shares; NaN where the table has none."""
+        return cells.reals(name) if name in cells.columns else np.full(len(cells), math.nan)
+
+    index = whole("index")
+    part = whole("slice")
+    start_ns = whole("start_ns")
+    end_ns = whole("end_ns")
+    columns = cells.by_sensor("columns_", whole).astype(np.int64)
+    missing = cells.by_sensor("missing_", reals)
+    # Unknown: NaN, or empty in outputs of earlier versions.
+    estimated: BoolArray = np.logical_not(np.all(np.isfinite(missing), axis=0))
+    expected = columns + np.where(estimated, 0, missing).astype(np.int64)
+    for i in np.flatnonzero(estimated).tolist():
+        present = columns[columns[:, i] > 0, i]
+        # The head and the tail are shorter; most windows are whole.
+        expected[:, i] = 0 if not len(present) else int(median(present))
     # Empty in a scan without columns.
-    first_ns = _whole([text or "0" for text in cells["first_stamp_ns"]])
-    last_ns = _whole([text or "0" for text in cells["last_stamp_ns"]])
+    first_ns = whole("first_stamp_ns", 0)
+    last_ns = whole("last_stamp_ns", 0)
+    # 0: the packets have no receive times.
+    ready_ns = whole("ready_host_ns", 0) if "ready_host_ns" in cells.columns else 0 * end_ns
     return Windows(
         sensors=names,
         slices=slices,
@@ -142,17 +138,17 @@ def _windows(cells: dict[str, tuple[str, ...]], names: tuple[str, ...], slices: 
         step=index * slices + part,
         start_ns=start_ns,
         end_ns=end_ns,
-        points=_whole(cells["points"]),
-        complete=np.array([cell == "true" for cell in cells["complete"]], dtype=bool),
+        points=whole("points"),
+        complete=cells.flags("complete"),
         span_ms=(last_ns - first_ns) / NS_PER_MS,
-        delay_ms=_delays_ms(cells.get("ready_host_ns"), end_ns),
+        delay_ms=np.where(ready_ns == 0, math.nan, (ready_ns - end_ns) / NS_PER_MS),
         columns=columns,
         expected=expected,
         estimated=estimated,
-        fill=_fill(columns, expected, estimated, _shares(cells, "fill", names, rows)),
-        gap_ms=gap_ms,
-        coverage=_shares(cells, "coverage", names, rows),
-        overlap=_shares(cells, "overlap", names, rows),
+        fill=_fill(columns, expected, estimated, cells.by_sensor("fill_", reals)),
+        gap_ms=cells.by_sensor("max_gap_ns_", whole) / NS_PER_MS,
+        coverage=cells.by_sensor("coverage_", reals),
+        overlap=cells.by_sensor("overlap_", reals),
     )
 
 
@@ -165,33 +161,6 @@ def _fill(columns: I64Array, expected: I64Array, estimated: BoolArray, known: F6
     is_whole |= estimated & (share >= _NEARLY)
     own = np.where(is_whole, 1.0, share)
     return np.clip(np.where(np.isfinite(known), known, own), 0.0, 1.0)
-
-
-def _whole(texts: Sequence[str]) -> I64Array:
-    values = [int(text) for text in texts]
-    if any(abs(value) > _LARGEST for value in values):
-        raise ValueError("a number of more than 62 bits")
-    return np.array(values, dtype=np.int64)
-
-
-def _numbers(texts: Sequence[str]) -> F64Array:
-    return np.array([float(text) if text else math.nan for text in texts])
-
-
-def _delays_ms(texts: Sequence[str] | None, end_ns: I64Array) -> F64Array:
-    if texts is None or not all(texts):
-        return np.full(len(end_ns), math.nan)
-    ready_ns = _whole(texts)
-    # 0: the packets have no receive times.
-    return np.where(ready_ns == 0, math.nan, (ready_ns - end_ns) / NS_PER_MS)
-
-
-def _shares(
-    cells: dict[str, tuple[str, ...]], word: str, names: tuple[str, ...], rows: int
-) -> F64Array:
-    absent = ("",) * rows
-    columns = [_numbers(cells.get(f"{word}_{name}", absent)) for name in names]
-    return np.stack(columns, axis=1) if columns else np.zeros((rows, 0))
 
 
 @dataclass(frozen=True, slots=True)

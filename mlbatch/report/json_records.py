@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable
-from dataclasses import fields, is_dataclass
+from dataclasses import MISSING, fields, is_dataclass
 from functools import lru_cache
 from types import NoneType, UnionType
 from typing import Any, Union, get_args, get_origin, get_type_hints
@@ -26,82 +27,60 @@ def to_json(value: object) -> object:
     return value
 
 
-def from_json(kind: Any, found: object) -> Any:
-    """The value of a type that `to_json` gave; ValueError for another."""
-    return _reader(kind)(found)
+def from_json(kind: Any, found: object, *, tolerant: bool = False) -> Any:
+    """The value of a type that `to_json` gave; ValueError for another.
+
+    tolerant: of another version, or damaged: what is unknown is left out, and a value that is
+    absent or of another type is the default of its field, else 0, "", None or empty.
+    """
+    try:
+        return _reader(kind, tolerant)(found)
+    except (TypeError, OverflowError) as err:
+        raise ValueError(str(err)) from err
 
 
 Read = Callable[[Any], Any]
 
 
 @lru_cache(maxsize=1024)
-def _reader(kind: Any) -> Read:
+def _reader(kind: Any, tolerant: bool) -> Read:
     """Return what reads values of a type."""
     origin = get_origin(kind)
+    arguments = get_args(kind)
     if origin in (Union, UnionType):
-        return _optional(kind)
+        (inner,) = (one for one in arguments if one is not NoneType)
+        inside = _reader(inner, tolerant)
+        return lambda found: None if found is None else inside(found)
     if origin is np.ndarray:
-        return _array
-    if origin is tuple:
-        return _tuple(get_args(kind))
-    if origin is list:
-        return _list(get_args(kind)[0])
+        return lambda found: np.array(found, np.float64)
+    if origin is tuple and arguments[-1] is not Ellipsis:
+        readers = [_reader(one, tolerant) for one in arguments]
+        return lambda found: tuple(
+            [each(one) for each, one in zip(readers, _of(list, found), strict=True)]
+        )
+    if origin in (tuple, list):
+        inside = _reader(arguments[0], tolerant)
+        return lambda found: origin([inside(one) for one in _of(list, found)])
     if origin is dict:
-        return _dict(get_args(kind)[1])
+        inside = _reader(arguments[1], tolerant)
+        return lambda found: {name: inside(one) for name, one in _of(dict, found).items()}
     if kind in (bool, int, float, str):
-        return _plain(kind)
-    return _record(kind)
+        return lambda found: kind(_of(kind, found))
+    return _tolerant_record(kind) if tolerant else _record(kind)
 
 
-def _plain(kind: type) -> Read:
-    # A float may be written as a whole number; True is no number.
-    kinds = (int, float) if kind is float else (kind,)
-
-    def read(found: object) -> object:
-        if type(found) not in kinds:
-            raise ValueError(f"{found!r} instead of {kind.__name__}")
-        return kind(found)
-
-    return read
-
-
-def _optional(kind: Any) -> Read:
-    (inner,) = (one for one in get_args(kind) if one is not NoneType)
-    inside = _reader(inner)
-    return lambda found: None if found is None else inside(found)
-
-
-def _array(found: object) -> object:
-    return np.array(found, np.float64)
-
-
-def _tuple(kinds: tuple[Any, ...]) -> Read:
-    if kinds[-1] is Ellipsis:
-        inside = _reader(kinds[0])
-        return lambda found: tuple([inside(one) for one in _items(found)])
-    readers = [_reader(kind) for kind in kinds]
-
-    def read(found: object) -> object:
-        return tuple([each(one) for each, one in zip(readers, _items(found), strict=True)])
-
-    return read
-
-
-def _list(kind: Any) -> Read:
-    inside = _reader(kind)
-    return lambda found: [inside(one) for one in _items(found)]
-
-
-def _dict(kind: Any) -> Read:
-    inside = _reader(kind)
-    return lambda found: {name: inside(one) for name, one in _fields(found).items()}
+def _of(kind: type, found: Any) -> Any:
+    """A value of a type; a float may be written as a whole number, and True is no number."""
+    if type(found) is not kind and (kind, type(found)) != (float, int):
+        raise ValueError(f"{found!r} instead of {kind.__name__}")
+    return found
 
 
 def _record(kind: Any) -> Read:
-    readers = {name: _reader(one) for name, one in get_type_hints(kind).items()}
+    readers = {name: _reader(one, False) for name, one in get_type_hints(kind).items()}
 
     def read(found: object) -> object:
-        given = _fields(found)
+        given = _of(dict, found)
         if set(given) != set(readers):
             raise ValueError(f"fields {', '.join(given)} of a {kind.__name__}")
         return kind(**{name: each(given[name]) for name, each in readers.items()})
@@ -109,13 +88,33 @@ def _record(kind: Any) -> Read:
     return read
 
 
-def _items(found: object) -> list[Any]:
-    if not isinstance(found, list):
-        raise ValueError(f"{found!r} instead of a list")
-    return found
+def _tolerant_record(kind: Any) -> Read:
+    hints = get_type_hints(kind)
+    readers = {name: _reader(one, True) for name, one in hints.items()}
+    known = getattr(kind, "_field_defaults", None)
+    if known is None:
+        known = {one.name for one in fields(kind) if one.default_factory is not MISSING}
+        known |= {one.name for one in fields(kind) if one.default is not MISSING}
+    needed = [name for name in hints if name not in known]
+
+    def read(found: object) -> object:
+        given = found if isinstance(found, dict) else {}
+        values = {name: _nothing(hints[name]) for name in needed}
+        for name in readers.keys() & given.keys():
+            with contextlib.suppress(ValueError, TypeError, OverflowError):
+                values[name] = readers[name](given[name])
+        return kind(**values)
+
+    return read
 
 
-def _fields(found: object) -> dict[str, Any]:
-    if not isinstance(found, dict):
-        raise ValueError(f"{found!r} instead of an object")
-    return found
+def _nothing(kind: Any) -> object:
+    """The value of a field that is absent."""
+    origin = get_origin(kind)
+    if origin in (Union, UnionType):
+        return None
+    if origin is np.ndarray:
+        return np.zeros(0)
+    if (origin or kind) in (tuple, list, dict, bool, int, float, str):
+        return (origin or kind)()
+    return _reader(kind, True)(None)

@@ -8,12 +8,10 @@ from functools import partial
 from typing import NamedTuple, TypeAlias
 
 from mlbatch.errors import UsageError
-from mlbatch.report.report import ACCEPTED_WARNINGS, CUT_OFF
+from mlbatch.report.report import ACCEPTED_WARNINGS, CUT_OFF, RunReport
 
 # A part and the whole that it is a share of; 0: it is a share of nothing.
 Amount: TypeAlias = tuple[int, int]
-# report.json as parsed or built.
-Report: TypeAlias = Mapping[str, object]
 
 _LIMIT = r"\s*([a-z_]+)\s*>\s*(\d+(?:\.\d*)?|\.\d+)\s*(%?)\s*"
 _EXAMPLE = "write loss>0.1%,underfilled>0"
@@ -27,7 +25,7 @@ class Limit(NamedTuple):
     most: float
     is_percent: bool
 
-    def exceeded(self, report: Report) -> str:
+    def exceeded(self, report: RunReport) -> str:
         """What exceeds the limit, as text; "" if nothing does."""
         quantity = _QUANTITIES[self.quantity]
         for owner, (part, whole) in quantity.amounts(report):
@@ -44,8 +42,8 @@ def parse_limits(texts: Sequence[str]) -> tuple[Limit, ...]:
     return tuple(_parsed(part) for text in texts for part in text.split(","))
 
 
-def exceeded(limits: Sequence[Limit], report: Report) -> list[str]:
-    """What exceeds limits, a line each; report: report.json."""
+def exceeded(limits: Sequence[Limit], report: RunReport) -> list[str]:
+    """What exceeds limits, a line each."""
     return [line for limit in limits if (line := limit.exceeded(report))]
 
 
@@ -72,60 +70,33 @@ def _parsed(text: str) -> Limit:
 # -- quantities -----------------------------------------------------------------------------------
 
 
-def _loss(report: Report) -> Iterator[tuple[str, Amount]]:
-    for name, packets in _packets(report):
-        lost = _number(packets, "lost")
-        yield name, (lost, lost + _number(packets, "accepted"))
+def _loss(report: RunReport) -> Iterator[tuple[str, Amount]]:
+    for sensor in report.sensors:
+        packets = sensor.ledger.packets
+        yield sensor.name, (packets.lost, packets.lost + packets.accepted)
 
 
-def _rejected(report: Report) -> Iterator[tuple[str, Amount]]:
-    for name, packets in _packets(report):
-        rejected = _section(packets, "rejected")
-        yield (
-            name,
-            (sum(_number(rejected, reason) for reason in rejected), _number(packets, "read")),
-        )
+def _rejected(report: RunReport) -> Iterator[tuple[str, Amount]]:
+    for sensor in report.sensors:
+        packets = sensor.ledger.packets
+        yield sensor.name, (sum(packets.rejected.values()), packets.read)
 
 
-def _scans(report: Report, key: str) -> Iterator[tuple[str, Amount]]:
-    scans = _section(report, "scans")
-    yield "", (_number(scans, key), _number(scans, "written"))
+def _scans(report: RunReport, key: str) -> Iterator[tuple[str, Amount]]:
+    yield "", (getattr(report.scans, key), report.scans.written)
 
 
-def _without_points(report: Report) -> Iterator[tuple[str, Amount]]:
-    scans = _section(report, "scans")
-    counts = _section(scans, "no_points")
-    for name in counts:
-        yield name, (_number(counts, name), _number(scans, "written"))
+def _without_points(report: RunReport) -> Iterator[tuple[str, Amount]]:
+    for name, count in report.scans.no_points.items():
+        yield name, (count, report.scans.written)
 
 
-def _cut_off(report: Report) -> Iterator[tuple[str, Amount]]:
-    yield "", (sum(one.get("code") == CUT_OFF for one in _list(report, "warnings")), 0)
+def _cut_off(report: RunReport) -> Iterator[tuple[str, Amount]]:
+    yield "", (sum(one.code == CUT_OFF for one in report.warnings), 0)
 
 
-def _warnings(report: Report) -> Iterator[tuple[str, Amount]]:
-    codes = [one.get("code") for one in _list(report, "warnings")]
-    yield "", (sum(code not in ACCEPTED_WARNINGS for code in codes), 0)
-
-
-def _packets(report: Report) -> Iterator[tuple[str, Report]]:
-    for one in _list(report, "sensors"):
-        yield str(one.get("name")), _section(one, "packets")
-
-
-def _section(report: Report, key: str) -> Report:
-    found = report.get(key)
-    return found if isinstance(found, Mapping) else {}
-
-
-def _list(report: Report, key: str) -> list[Report]:
-    found = report.get(key)
-    return [one for one in found if isinstance(one, Mapping)] if isinstance(found, list) else []
-
-
-def _number(section: Report, key: str) -> int:
-    value = section.get(key)
-    return value if isinstance(value, int) else 0
+def _warnings(report: RunReport) -> Iterator[tuple[str, Amount]]:
+    yield "", (sum(one.code not in ACCEPTED_WARNINGS for one in report.warnings), 0)
 
 
 class _Quantity(NamedTuple):
@@ -136,7 +107,7 @@ class _Quantity(NamedTuple):
     """
 
     unit: str
-    amounts: Callable[[Report], Iterator[tuple[str, Amount]]]
+    amounts: Callable[[RunReport], Iterator[tuple[str, Amount]]]
     is_share: bool = True
 
 

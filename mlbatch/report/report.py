@@ -6,10 +6,13 @@ import json
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from fractions import Fraction
-from typing import NamedTuple, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 import mlbatch
 from mlbatch.arrays import F64Array
+from mlbatch.bounded import parse_json
+from mlbatch.errors import RecordingError
+from mlbatch.report.json_records import from_json
 from mlbatch.report.ledger import (
     CAPTURE_REASONS,
     COLUMN_REASONS,
@@ -23,7 +26,7 @@ from mlbatch.report.ledger import (
 )
 from mlbatch.report.motion import MotionLedger
 from mlbatch.report.scan_table import ScanStatistics
-from mlbatch.types import CaptureCounts
+from mlbatch.types import VARIANTS, CaptureCounts
 from mlbatch.units import NS_PER_S
 
 Json: TypeAlias = bool | int | float | str | Sequence["Json"] | Mapping[str, "Json"] | None
@@ -151,13 +154,80 @@ class RunReport(NamedTuple):
     deskew: MotionLedger | None = None  # with --deskew
     command: str = ""  # command line; "" for runs by the Python interface
     identity: dict[str, str] | None = None  # of the job, see `identity_of_parts`
+    version: str = mlbatch.__version__
+
+    @property
+    def recorded_s(self) -> float:
+        """Length of the recording; 0: unknown."""
+        return 0.0 if self.timing is None else self.timing.recorded_s
+
+    @classmethod
+    def from_json(cls, root: object) -> RunReport:
+        """The content of report.json, but for `deskew`; of any version.
+
+        What is absent or of another type is empty, 0 or None, so that damaged reports are read.
+        """
+        report = _section(root)
+        grid = _section(report.get("grid"))
+        sensors = report.get("sensors")
+        found: RunReport = from_json(
+            cls,
+            {
+                **report,
+                **grid,
+                "sensors": [_fields(one) for one in sensors] if isinstance(sensors, list) else [],
+                "variants": [[name, grid[name]] for name in VARIANTS if name in grid],
+                "timing": report.get("timing") or None,
+                "deskew": None,
+            },
+            tolerant=True,
+        )
+        return found
+
+
+def parse_report(where: object, text: str | bytes) -> dict[str, Any]:
+    """The values of a report.json given as text; RecordingError for another document."""
+    try:
+        root = parse_json(text)
+    except ValueError as err:
+        raise RecordingError(
+            f"{where}: expected a report in JSON, found {err}; restore it, or convert again"
+        ) from err
+    schema = _section(root).get("schema", "none")
+    if schema != SCHEMA:
+        raise RecordingError(
+            f"{where}: expected a report of schema {SCHEMA}, found {schema!r}; name the report of "
+            "`mlbatch convert`"
+        )
+    return _section(root)
+
+
+def report_of(where: object, text: str | bytes) -> RunReport:
+    """The content of a report.json given as text; RecordingError for another document."""
+    return RunReport.from_json(parse_report(where, text))
+
+
+def _section(value: object) -> dict[str, Any]:
+    return value if isinstance(value, dict) else {}
+
+
+def _fields(sensor: object) -> dict[str, Any]:
+    """The fields of a `SensorReport` in the JSON of a sensor."""
+    found = _section(sensor)
+    extrinsics = _section(found.get("extrinsics"))
+    return {
+        **found,
+        "ledger": found,
+        "extrinsics_source": extrinsics.get("source"),
+        "body_from_sensor": extrinsics.get("body_from_sensor"),
+    }
 
 
 def build_report(run: RunReport) -> Section:
     """The report as JSON values, in the order of docs/report.md."""
     return {
         "schema": SCHEMA,
-        "version": mlbatch.__version__,
+        "version": run.version,
         **({"command": run.command} if run.command else {}),
         **({"identity": run.identity} if run.identity else {}),
         "inputs": [item._asdict() for item in run.inputs],

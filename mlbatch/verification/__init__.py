@@ -11,9 +11,9 @@ from os import PathLike
 from pathlib import Path
 
 from mlbatch.outputs.damage import CheckLog, VerifyError, Violation
+from mlbatch.outputs.run_files import RunFiles
 from mlbatch.verification.examination import Progress
 from mlbatch.verification.outputs import Output, check_output
-from mlbatch.verification.report_checks import ReportPlaces
 from mlbatch.verification.verdict import CHECKS, Check, Verdict
 
 __all__ = ["CHECKS", "Check", "Verdict", "VerifyError", "Violation", "verify"]
@@ -47,4 +47,4 @@ def verify(
     log.ok("container")
     if unfinished.exists():
         log.fail("container", unfinished.name, "no unfinished run next to the output", "one")
-    return check_output(Output(path, ReportPlaces.of(path, report), log, progress))
+    return check_output(Output(path, RunFiles.of(path, report), log, progress))

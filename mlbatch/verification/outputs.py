@@ -13,21 +13,19 @@ from typing import TYPE_CHECKING
 from mlbatch.outputs import npz
 from mlbatch.outputs.damage import CheckLog, DamageError, VerifyError
 from mlbatch.outputs.file_formats import FileFormat
-from mlbatch.outputs.float_rows import RowReader
 from mlbatch.outputs.folders import scan_files
 from mlbatch.outputs.kinds import kind_of
 from mlbatch.outputs.metadata import RunMetadata, metadata_of_grid
+from mlbatch.outputs.run_files import PIECES, TABLE, RunFiles
 from mlbatch.verification import messages
 from mlbatch.verification.examination import Examination, Progress
 from mlbatch.verification.messages import LAYOUT_LIMITS, TopicChecks
-from mlbatch.verification.report_checks import TABLE, ReportFiles, ReportPlaces
+from mlbatch.verification.report_checks import ReportFiles
 from mlbatch.verification.verdict import Verdict, outcomes
 
 if TYPE_CHECKING:
     from mlbatch.outputs.rosbag2 import BagFile
 
-# In mlbatch.grid of each of several files; their report and table are in the folder.
-_PIECES = "windows_per_file"
 _RANGES = "ranges to 1 m: beams do not leave from the origin of their sensor"
 _NO_REPORT = "no report in or next to the output; give it with --report"
 _FOREIGN = "expected an output of mlbatch (a folder of scans, an MCAP file, a bag)"
@@ -39,7 +37,7 @@ class Output:
     """An output to check."""
 
     path: Path
-    places: ReportPlaces
+    files: RunFiles
     log: CheckLog
     progress: Progress | None = None
 
@@ -86,8 +84,8 @@ def _check_files(form: FileFormat, output: Output) -> Verdict:
     log = output.log
     reader = form.reader(log)
     limits = dict(form.limits)
-    files = ReportFiles.read(log, output.places)
-    if not output.places.table.exists():
+    files = ReportFiles.read(log, output.files)
+    if not output.files.table.exists():
         log.fail("table", TABLE, "the table of scans", "none")
     scans = scan_files(log, output.path, form.suffix)
     if not scans:
@@ -99,10 +97,9 @@ def _check_files(form: FileFormat, output: Output) -> Verdict:
             f"{scans[0].path}: {err}; restore the first scan, or convert again"
         ) from err
     metadata = files.metadata(log, own)
-    if isinstance(reader, RowReader):
-        reader.know(metadata)
-        if metadata.rate is None:
-            limits |= dict.fromkeys(("grid", "index"), f"rows have no rate; {_NO_REPORT}")
+    reader.know(metadata)
+    if metadata.rate is None:
+        limits |= dict.fromkeys(("grid", "index"), f"rows have no rate; {_NO_REPORT}")
     examination = Examination(log, str(output.path), metadata, files, output.progress)
     for scan in reader.scans(scans):
         examination.scan(scan)
@@ -143,7 +140,7 @@ def _check_mcap(
                 f"{path}: expected an MCAP file of mlbatch, with a metadata record mlbatch.grid, "
                 f"found one of {file.library or 'an unknown writer'!r}; {_NAME_ONE}"
             )
-        if _PIECES in grid and not output.path.is_dir():
+        if PIECES in grid and not output.path.is_dir():
             raise VerifyError(
                 f"{path}: expected a whole output, found one of the files of a bag; name its folder"
             )
@@ -153,15 +150,15 @@ def _check_mcap(
     where = paths[0].name
     for path, grid in zip(paths[1:], grids[1:], strict=True):
         log.equal("metadata", f"{path.name} mlbatch.grid", grids[0], grid)
-    if _PIECES in grids[0] or len(paths) > 1:
-        files = ReportFiles.read(log, output.places)
-        if not output.places.table.exists():
+    if PIECES in grids[0] or len(paths) > 1:
+        files = ReportFiles.read(log, output.files)
+        if not output.files.table.exists():
             log.fail("table", TABLE, "the table of scans", "none")
     else:
         attachment = mcaps[0].attachments.get(TABLE)
         report = mcaps[0].metadata.get("mlbatch.report")
         files = ReportFiles.inside(log, paths[0], report, attachment)
-        files.check_copies(log, attachment, output.places)
+        files.check_copies(log, attachment, output.files)
     metadata = files.metadata(log, metadata_of_grid(log, where, grids[0]))
     examination = Examination(log, str(output.path), metadata, files, output.progress)
     topics = TopicChecks(log, metadata, examination, files.report)
@@ -183,7 +180,7 @@ def _check_bag(output: Output) -> Verdict:
 
     log = output.log
     path = output.path
-    files = ReportFiles.read(log, output.places)
+    files = ReportFiles.read(log, output.files)
     metadata = files.metadata(log, RunMetadata())
     examination = Examination(log, str(path), metadata, files, output.progress)
     topics = TopicChecks(log, metadata, examination, files.report)

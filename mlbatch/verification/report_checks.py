@@ -10,17 +10,16 @@ from typing import TypeAlias, cast
 import numpy as np
 
 from mlbatch.arrays import BoolArray, F64Array, I64Array
-from mlbatch.bounded import MOST_TABLE_BYTES, parse_json, read_text
+from mlbatch.bounded import parse_json
 from mlbatch.errors import UsageError
 from mlbatch.outputs.damage import CheckLog, VerifyError
 from mlbatch.outputs.metadata import RunMetadata, with_variants
+from mlbatch.outputs.run_files import TABLE, RunFiles
 from mlbatch.types import VARIANTS
 from mlbatch.units import parse_rate
 from mlbatch.verification.scan_checks import Grid
 from mlbatch.verification.table import OutputTotals, Table, read_table
 
-REPORT = "report.json"
-TABLE = "scans.csv"
 SCHEMA = "mlbatch.report/1"
 _NS = 10**9
 _NS_PER_MS = 1e6
@@ -170,52 +169,6 @@ class Document:
 # -- files of report and table --------------------------------------------------------------------
 
 
-@dataclass(frozen=True, slots=True)
-class ReportPlaces:
-    """Paths of the report and the table of an output."""
-
-    report: Path
-    table: Path
-    # `--report` names the report: it has to exist.
-    is_given: bool
-
-    @classmethod
-    def of(cls, output: Path, report: Path | None) -> ReportPlaces:
-        """In an output folder, next to an output file; report: the path of `--report`."""
-        if output.is_dir():
-            usual = output / REPORT
-            table = output / TABLE
-        else:
-            usual = output.with_name(f"{output.name}.{REPORT}")
-            table = output.with_name(f"{output.name}.{TABLE}")
-        return cls(report or usual, table, report is not None)
-
-    def report_text(self) -> str | None:
-        """The text of the report."""
-        text = _text(self.report)
-        if text is None and self.is_given:
-            raise VerifyError(
-                f"{self.report}: expected a report, found no such file; leave out --report"
-            )
-        return text
-
-    def table_text(self) -> str | None:
-        """The text of the table."""
-        return _text(self.table)
-
-
-def _text(path: Path) -> str | None:
-    """A small file; None if there is none."""
-    try:
-        return read_text(path, MOST_TABLE_BYTES)
-    except FileNotFoundError:
-        return None
-    except OSError as err:
-        raise VerifyError(f"{path}: expected a readable file, found {err.strerror!r}") from err
-    except UnicodeDecodeError as err:
-        raise VerifyError(f"{path}: expected text in UTF-8, found other bytes; restore it") from err
-
-
 @dataclass(slots=True)
 class ReportFiles:
     """The report and the table of a run; None if there is none."""
@@ -224,12 +177,12 @@ class ReportFiles:
     table: Table | None
 
     @classmethod
-    def read(cls, log: CheckLog, places: ReportPlaces) -> ReportFiles:
+    def read(cls, log: CheckLog, files: RunFiles) -> ReportFiles:
         """Files in the output folder, or next to the output file."""
-        text = places.report_text()
-        report = None if text is None else Document.parsed(log, places.report, text)
-        text = places.table_text()
-        return cls(report, None if text is None else read_table(log, places.table.name, text))
+        text = files.report_text()
+        report = None if text is None else Document.parsed(log, files.report, text)
+        text = files.table_text()
+        return cls(report, None if text is None else read_table(log, files.table.name, text))
 
     @classmethod
     def inside(
@@ -249,16 +202,16 @@ class ReportFiles:
         text = attachment.decode("utf-8", "replace")
         return cls(report, read_table(log, f"{where} {TABLE}", text))
 
-    def check_copies(self, log: CheckLog, attachment: bytes | None, places: ReportPlaces) -> None:
+    def check_copies(self, log: CheckLog, attachment: bytes | None, files: RunFiles) -> None:
         """Check the files next to an MCAP file against those inside."""
-        text = places.report_text()
+        text = files.report_text()
         if text is not None and self.report is not None:
-            _check_same(log, self.report, Document.parsed(log, places.report, text))
-        table = places.table_text()
+            _check_same(log, self.report, Document.parsed(log, files.report, text))
+        table = files.table_text()
         if table is not None and attachment is not None:
             log.ok("table")
             if table.encode() != attachment:
-                log.fail("table", places.table.name, "the bytes of the attachment", "others")
+                log.fail("table", files.table.name, "the bytes of the attachment", "others")
 
     def metadata(self, log: CheckLog, own: RunMetadata) -> RunMetadata:
         """Metadata `own` of the output, joined with those of report and table."""

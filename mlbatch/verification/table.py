@@ -1,12 +1,10 @@
-"""scans.csv: parsed, checked on its own, and checked against the sums of the scans.
+"""scans.csv: checked on its own, and checked against the sums of the scans.
 
 Columns that later versions add are ignored.
 """
 
 from __future__ import annotations
 
-import csv
-import math
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -14,11 +12,10 @@ import numpy as np
 from mlbatch.arrays import BoolArray, F64Array, I64Array
 from mlbatch.outputs.damage import CheckLog
 from mlbatch.outputs.stored_scan import COLUMN_NS, Points, StoredScan
+from mlbatch.outputs.table import COLUMNS, Cells, TableError
 from mlbatch.verification.scan_checks import Grid
 
-_FIRST = ("index", "slice", "start_ns", "end_ns", "first_stamp_ns", "last_stamp_ns")
 _COUNTS = ("points", "columns")
-_COLUMNS = "columns_"
 _GAP = "max_gap_ns_"
 _FILL = "fill_"
 _CHECKSUM = "checksum"
@@ -26,7 +23,6 @@ _CHECKSUM = "checksum"
 _CHECKSUMS = 1 << 32
 # Of a float32, relative.
 _FILL_ERROR = 1e-6
-_WORDS = {"true": True, "false": False}
 # Below and above all times.
 _EARLY_NS = -(2**62)
 _LATE_NS = 2**62
@@ -78,101 +74,50 @@ class Table:
 
 
 def read_table(log: CheckLog, where: str, text: str) -> Table | None:
-    """Parse scans.csv; None if it is not usable, which is a violation."""
+    """Read scans.csv; None if it is not usable, which is a violation."""
     try:
-        lines = list(csv.reader(text.splitlines()))
-    except csv.Error as err:
-        log.fail("table", where, "lines of comma-separated values", str(err))
+        return _table(log, where, Cells.of(text))
+    except TableError as err:
+        log.fail("table", err.at(where), err.expected, err.found)
         return None
-    head = lines[0] if lines else []
-    if tuple(head[: len(_FIRST)]) != _FIRST:
-        log.fail("table", f"{where} line 1", ",".join(_FIRST), ",".join(head))
-        return None
-    sensors = tuple(name.removeprefix(_COLUMNS) for name in head if name.startswith(_COLUMNS))
-    names = [*_FIRST, *_COUNTS]
-    names += [_COLUMNS + name for name in sensors]
-    names += [_GAP + name for name in sensors]
-    names += [_CHECKSUM] if _CHECKSUM in head else []
-    missing = [name for name in (*names, "complete") if name not in head]
+
+
+def _table(log: CheckLog, where: str, cells: Cells) -> Table:
+    sensors = cells.sensors
+    by_sensor = [prefix + name for prefix in (COLUMNS, _GAP) for name in sensors]
+    missing = [name for name in (*_COUNTS, *by_sensor, "complete") if name not in cells.columns]
     if missing or not sensors:
-        log.fail("table", where, f"columns {', '.join(missing) or 'of sensors'}", "none")
-        return None
-    for number, line in enumerate(lines):
-        if len(line) != len(head):
-            log.fail("table", f"{where} line {number + 1}", f"{len(head)} cells", len(line))
-            return None
-    if len(lines) == 1:
-        log.fail("table", where, "a line for each scan", "none")
-        return None
-    cells = dict(zip(head, zip(*lines[1:], strict=True), strict=True))
-    return _parsed(log, where, sensors, names, cells)
-
-
-def _parsed(
-    log: CheckLog,
-    where: str,
-    sensors: tuple[str, ...],
-    names: list[str],
-    cells: dict[str, tuple[str, ...]],
-) -> Table | None:
-    number: dict[str, I64Array] = {}
-    for name in names:
-        values = _integers(log, where, name, cells[name])
-        if values is None:
-            return None
-        number[name] = values
-    for row, cell in enumerate(cells["complete"]):
-        if cell not in _WORDS:
-            log.fail("table", f"{where} line {row + 2} complete", "true or false", cell)
-            return None
-    fill = _fills(
-        log, where, [cells[name] for name in map(_FILL.__add__, sensors) if name in cells]
-    )
+        raise TableError("", f"columns {', '.join(missing) or 'of sensors'}", "none")
+    if not len(cells):
+        raise TableError("", "a line for each scan", "none")
     return Table(
         where=where,
         sensors=sensors,
-        index=number["index"],
-        slice=number["slice"],
-        start_ns=number["start_ns"],
-        end_ns=number["end_ns"],
-        first_ns=number["first_stamp_ns"],
-        last_ns=number["last_stamp_ns"],
-        points=number["points"],
-        columns=number["columns"],
-        columns_of=np.stack([number[_COLUMNS + name] for name in sensors], axis=1),
-        gap_ns=np.stack([number[_GAP + name] for name in sensors], axis=1),
-        fill=fill if fill is not None and fill.shape[1] == len(sensors) else None,
-        checksum=number.get(_CHECKSUM),
-        complete=np.array([_WORDS[cell] for cell in cells["complete"]]),
+        index=cells.integers("index"),
+        slice=cells.integers("slice"),
+        start_ns=cells.integers("start_ns"),
+        end_ns=cells.integers("end_ns"),
+        first_ns=cells.integers("first_stamp_ns"),
+        last_ns=cells.integers("last_stamp_ns"),
+        points=cells.integers("points"),
+        columns=cells.integers("columns"),
+        columns_of=cells.by_sensor(COLUMNS, cells.integers),
+        gap_ns=cells.by_sensor(_GAP, cells.integers),
+        fill=_fills(log, where, cells),
+        checksum=cells.integers(_CHECKSUM) if _CHECKSUM in cells.columns else None,
+        complete=cells.flags("complete"),
     )
 
 
-def _integers(log: CheckLog, where: str, name: str, cells: tuple[str, ...]) -> I64Array | None:
-    """A column of integers; None if a cell is none, which is a violation."""
-    values = [_integer(cell) for cell in cells]
-    if None in values:
-        row = values.index(None)
-        log.fail("table", f"{where} line {row + 2} {name}", "a number", cells[row])
+def _fills(log: CheckLog, where: str, cells: Cells) -> F64Array | None:
+    """Fills by sensor; None in older tables, or if a cell is no share, which is a violation."""
+    if not all(_FILL + name in cells.columns for name in cells.sensors):
         return None
-    return np.array(values, np.int64)
-
-
-def _fills(log: CheckLog, where: str, columns: list[tuple[str, ...]]) -> F64Array | None:
-    """The columns of fill, (n, s); None if there are none, or a cell is no share (a violation)."""
     try:
-        found = [[float(cell) if cell else math.nan for cell in cells] for cells in columns]
-    except ValueError as err:
-        log.fail("table", f"{where} fill", "numbers from 0 to 1", err)
+        return cells.by_sensor(_FILL, cells.reals)
+    except TableError as err:
+        log.fail("table", f"{where} fill", "numbers from 0 to 1", err.__cause__)
         return None
-    return np.array(found, np.float64).T if found else None
-
-
-def _integer(cell: str) -> int | None:
-    try:
-        value = int(cell)
-    except ValueError:
-        return None
-    return value if -(2**63) <= value < 2**63 else None
 
 
 def check_table(log: CheckLog, table: Table, grid: Grid | None, first: int | None) -> None:
@@ -477,7 +422,7 @@ class OutputTotals:
             checks.equal("last_stamp_ns", table.last_ns, rows.last_ns)
             for sensor, name in enumerate(table.sensors):
                 columns = table.columns_of[:, sensor]
-                checks.equal(f"{_COLUMNS}{name}", columns, rows.columns_of[:, sensor])
+                checks.equal(f"{COLUMNS}{name}", columns, rows.columns_of[:, sensor])
                 self._check_gaps(checks, rows, sensor, apart)
         elif self.knows_columns:
             checks.equal("columns", table.columns, rows.columns)

@@ -17,6 +17,10 @@ from tests.builders.run import command
 from tests.digests.test_digest import FORMATS, MOVED, convert, other_rig
 
 Array = npt.NDArray[Any]
+POINTS = (
+    *("xyz", "intensity", "reflectivity", "range_m", "time_ns", "ring", "return_type"),
+    *("lidar_id", "column"),
+)
 
 
 def change(path: Path, **values: Callable[[Array], Array]) -> None:
@@ -126,8 +130,10 @@ def test_a_missing_point_is_the_first_difference(tmp_path: Path) -> None:
     a = convert(tmp_path / "a", "npz")
     b = tmp_path / "b"
     shutil.copytree(a, b)
-    change(b / "000003.npz", intensity=lambda array: np.delete(array, 100))
-    (first,) = diff(a, b).fields.values()
+    change(b / "000003.npz", **{name: lambda array: np.delete(array, 100, 0) for name in POINTS})
+    found = diff(a, b).fields
+    assert set(found) == {*POINTS}
+    first = found["intensity"]
     assert (first.scan, first.a, first.b, first.by) == ("000003", [27998], [27997], None)
     assert first.point is not None
     with np.load(a / "000003.npz") as scan:

@@ -11,14 +11,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import mlbatch
-from mlbatch.arrays import I64Array
 from mlbatch.errors import RecordingError, UsageError
 from mlbatch.options import PLY_STYLES
-from mlbatch.outputs.clouds import CloudPlace, scan_of_cloud
+from mlbatch.outputs.read import point_arrays
 from mlbatch.outputs.scan import Scan
+from mlbatch.outputs.stored_scan import StoredScan
 from mlbatch.python.recording import Recording
 from mlbatch.writers.point_layouts import CLOUD_LAYOUTS
-from tests.builders.scans import run_info
 from tests.contract.tree import ROOT
 
 FIXTURE = ROOT / "fixtures" / "two_lidars"
@@ -205,18 +204,18 @@ def test_one_file_of_a_folder(rec: Recording, tmp_path: Path) -> None:
 @given(st.lists(st.integers(0, 4_000_000_000), min_size=1))
 def test_float32_seconds_are_the_ns_that_give_them(times: list[int]) -> None:
     """Reading is the inverse of writing: what is read rounds to the same float32, toward zero."""
-    rows = np.zeros(len(times), CLOUD_LAYOUTS["kiss-icp"].dtype)
+    stored = StoredScan("", 0, np.zeros((len(times), 3), np.float32), organized=False)
+    stored.time_s = np.zeros(len(times), np.float32)
     exact = [Fraction(time, 10**9) for time in times]
-    for row, value in enumerate(exact):
+    for place, value in enumerate(exact):
         rounded = np.float32(float(value))
         if Fraction(float(rounded)) > value:
             rounded = np.nextafter(rounded, np.float32(0))
-        rows["time"][row] = rounded
-    place = CloudPlace(run_info(), 0, 0, 10**18, 10**18 + 10**10, None)
-    read: I64Array = scan_of_cloud(place, rows, True).time_ns.astype(np.int64)
-    for stored, found, time in zip(rows["time"].tolist(), read.tolist(), times, strict=True):
+        stored.time_s[place] = rounded
+    read = point_arrays(stored)["time_ns"].tolist()
+    for rounded_s, found, time in zip(stored.time_s.tolist(), read, times, strict=True):
         # The smallest whole nanosecond that is not before the stored time.
-        assert Fraction(found - 1, 10**9) < Fraction(stored) <= Fraction(found, 10**9)
+        assert Fraction(found - 1, 10**9) < Fraction(rounded_s) <= Fraction(found, 10**9)
         assert found <= time
 
 

@@ -13,7 +13,7 @@ import numpy.typing as npt
 import pytest
 
 from mlbatch.page import Source, write_page
-from mlbatch.page.values import Values
+from mlbatch.report.report import RunReport
 from tests.builders.sessions import FIXTURE
 from tests.contract.tree import run_mlbatch
 from tests.page.browser import CHROMIUM, NO_CHROMIUM, Browser, browser
@@ -108,7 +108,9 @@ def test_a_stall_is_red_where_it_was(tab: Browser, tmp_path: Path) -> None:
     columns = [[512, 0 if 30 <= index < 60 else 512] for index in range(100)]
     missing = [[512 - count for count in own] for own in columns]
     csv = table(("left", "right"), columns, missing)
-    source = Source(Values(report(sensor("left"), sensor("right", 1))), csv, None, tmp_path)
+    source = Source(
+        RunReport.from_json(report(sensor("left"), sensor("right", 1))), csv, None, tmp_path
+    )
     tab.open(page_of(tmp_path, source))
     assert tab.errors == []
     assert tab.run(f"{RED}(0)") == 0
@@ -123,7 +125,9 @@ def test_the_timeline_can_be_enlarged_down_to_windows(tab: Browser, tmp_path: Pa
     columns = [[512 - (index == 50), 512 - 40 * (index == 50)] for index in range(100)]
     missing = [[512 - count for count in own] for own in columns]
     csv = table(("left", "right"), columns, missing)
-    source = Source(Values(report(sensor("left"), sensor("right", 1))), csv, None, tmp_path)
+    source = Source(
+        RunReport.from_json(report(sensor("left"), sensor("right", 1))), csv, None, tmp_path
+    )
     tab.open(page_of(tmp_path, source))
     assert tab.run("document.getElementById('range').textContent") == "+0.0 s to +10.0 s"
     tab.drag("#timeline", 0.5, 0.6)
@@ -161,7 +165,7 @@ def test_hostile_names_run_nothing(tab: Browser, tmp_path: Path) -> None:
     warning = {"code": HOSTILE, "sensor": HOSTILE, "message": HOSTILE}
     document = report(sensor(HOSTILE), sensor("right", 1), warnings=[warning], command=HOSTILE)
     csv = table(("left", "right"), [[512, 512]] * 5)
-    tab.open(page_of(tmp_path, Source(Values(document), csv, None, tmp_path)))
+    tab.open(page_of(tmp_path, Source(RunReport.from_json(document), csv, None, tmp_path)))
     assert tab.errors == []
     assert tab.run("document.querySelectorAll('img').length") == 0
     assert tab.run("document.querySelectorAll('script').length") == 2
@@ -175,7 +179,7 @@ def test_an_hour_of_four_lidars_is_small_and_opens_quickly(tab: Browser, tmp_pat
     columns = (512 - lost).tolist()
     sensors = [sensor(name, i, drift_ppm=i) for i, name in enumerate(names)]
     csv = table(names, columns, lost.tolist())
-    source = Source(Values(report(*sensors, scans=36_000)), csv, None, tmp_path)
+    source = Source(RunReport.from_json(report(*sensors, scans=36_000)), csv, None, tmp_path)
     page = page_of(tmp_path, source)
     # 36,000 scans; clouds would add 0.7 MB.
     assert page.stat().st_size < 4_000_000

@@ -8,8 +8,8 @@ from typing import Any
 import pytest
 
 from mlbatch.page.findings import REMEDIES, Level, findings, percent, verdict
-from mlbatch.page.values import Values
 from mlbatch.page.windows import read_windows
+from mlbatch.report.report import RunReport
 from tests.contract.tree import PACKAGE, ROOT
 from tests.page.runs import report, sensor, table
 
@@ -20,13 +20,15 @@ def found(document: dict[str, Any], columns: list[list[int]] | None = None) -> l
     if columns is not None:
         missing = [[512 - count for count in own] for own in columns]
         windows = read_windows(table(("left", "right"), columns, missing), 1)
-    return [f"{one.level.name}: {one.text}" for one in findings(Values(document), windows)]
+    return [
+        f"{one.level.name}: {one.text}" for one in findings(RunReport.from_json(document), windows)
+    ]
 
 
 def test_a_clean_run_has_no_finding() -> None:
     document = report(sensor("left"), sensor("right", 1))
     assert found(document, [[512, 512]] * 10) == []
-    assert verdict(findings(Values(document), None)) == (
+    assert verdict(findings(RunReport.from_json(document), None)) == (
         Level.GOOD,
         "Packets, windows and clocks are fine; poses not checked",
         "",
@@ -68,7 +70,7 @@ def test_head_and_tail_are_partial_by_request() -> None:
     columns = [[100, 100], [512, 512], [512, 512], [512, 0]]
     missing = [[512 - count for count in own] for own in columns]
     text = table(("left", "right"), columns, missing).replace("\n0,0,", "\n-1,0,", 1)
-    texts = [one.text for one in findings(Values(document), read_windows(text, 1))]
+    texts = [one.text for one in findings(RunReport.from_json(document), read_windows(text, 1))]
     assert "1 scan of 10 is incomplete: a sensor does not cover the window." in texts
     assert "Head and tail are incomplete, as requested by --keep-partial." in texts
 
@@ -82,7 +84,7 @@ def test_head_and_tail_alone_are_no_good_run(written: int) -> None:
     text = table(("left", "right"), columns, missing).replace("\n0,0,", "\n-1,0,", 1)
     found_texts = [
         one.text
-        for one in findings(Values(document), read_windows(text, 1))
+        for one in findings(RunReport.from_json(document), read_windows(text, 1))
         if one.level is Level.WARNING
     ]
     assert found_texts[0].startswith("No window is whole")
@@ -108,15 +110,17 @@ def test_drifting_clocks_are_weighed_by_the_length_of_the_recording() -> None:
 def test_the_verdict_is_the_worst_finding() -> None:
     warning = {"code": "calibration", "sensor": "left", "message": "a note"}
     document = report(sensor("left", bad_size=50), sensor("right", 1, lost=2), warnings=[warning])
-    level, heading, others = verdict(findings(Values(document), None))
+    level, heading, others = verdict(findings(RunReport.from_json(document), None))
     assert level == Level.PROBLEM
     assert heading == "50 packets of left rejected (bad_size 50)."
     assert others == "1 problem and 1 warning below."
-    last = findings(Values(document), None)[-1]
+    last = findings(RunReport.from_json(document), None)[-1]
     assert (last.level, last.code, last.text) == (Level.NOTE, "calibration", "a note")
     # One that contradicts the packets is no mere note.
     warning["message"] = "expected packets of 1024x20, found those of 1024x10"
-    assert Level.WARNING in [one.level for one in findings(Values(document), None) if one.code]
+    assert Level.WARNING in [
+        one.level for one in findings(RunReport.from_json(document), None) if one.code
+    ]
 
 
 def test_a_run_without_a_scan_is_a_problem() -> None:
@@ -142,5 +146,7 @@ def test_shares_have_the_digits_they_need(part: int, whole: int, text: str) -> N
 
 @pytest.mark.parametrize("value", [None, "x", 5, [], [1], {"sensors": "x", "scans": []}])
 def test_a_damaged_report_gives_no_exception(value: Any) -> None:
-    findings(Values(value), None)
-    findings(Values({"sensors": [value], "warnings": [value], "faults": [value]}), None)
+    findings(RunReport.from_json(value), None)
+    findings(
+        RunReport.from_json({"sensors": [value], "warnings": [value], "faults": [value]}), None
+    )

@@ -112,5 +112,5 @@ def test_no_row_is_no_window(text: str) -> None:
 )
 def test_damage_is_one_line(old: str, new: str) -> None:
     text = table(("left",), [[512], [512]])
-    with pytest.raises(ExportError, match=r"scans\.csv: expected .* found .*; convert again"):
+    with pytest.raises(ExportError, match=r"scans\.csv.*: expected .* found .*; convert again"):
         read_windows(text.replace(old, new, 1), 1)

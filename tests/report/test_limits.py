@@ -6,26 +6,29 @@ import pytest
 
 from mlbatch.errors import UsageError
 from mlbatch.report.limits import exceeded, parse_limits
+from mlbatch.report.report import RunReport
 
-REPORT = {
-    "sensors": [
-        {"name": "a", "packets": {"read": 999, "accepted": 999, "lost": 1, "rejected": {}}},
-        {
-            "name": "b",
-            "packets": {
-                "read": 1000,
-                "accepted": 990,
-                "lost": 10,
-                "rejected": {"bad_crc": 7, "duplicate": 3},
+REPORT = RunReport.from_json(
+    {
+        "sensors": [
+            {"name": "a", "packets": {"read": 999, "accepted": 999, "lost": 1, "rejected": {}}},
+            {
+                "name": "b",
+                "packets": {
+                    "read": 1000,
+                    "accepted": 990,
+                    "lost": 10,
+                    "rejected": {"bad_crc": 7, "duplicate": 3},
+                },
             },
+        ],
+        "scans": {
+            **{"written": 40, "underfilled": 2, "incomplete": 0, "empty": 3, "empty_clouds": 0},
+            **{"dropped_incomplete": 4, "no_points": {"b": 5}},
         },
-    ],
-    "scans": {
-        **{"written": 40, "underfilled": 2, "incomplete": 0, "empty": 3, "empty_clouds": 0},
-        **{"dropped_incomplete": 4, "no_points": {"b": 5}},
-    },
-    "warnings": [{"code": "clouds"}, {"code": "loss"}, {"code": "cut_off"}],
-}
+        "warnings": [{"code": "clouds"}, {"code": "loss"}, {"code": "cut_off"}],
+    }
+)
 EXCEEDED = [
     # 10 of 1000 of b, 1 of 1000 of a.
     ("loss>0.99%", "loss>0.99%: found b: 10 of 1000 (1 %) packets lost"),
