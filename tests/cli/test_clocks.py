@@ -93,13 +93,6 @@ def test_clocks_apart_are_reported_with_the_remedy(shell: Shell) -> None:
     assert float(said[1]) == pytest.approx(-0.3, abs=0.003)
 
 
-def test_whole_seconds_have_names(shell: Shell) -> None:
-    outcome = shell(f"convert {RECORDING} --dry-run --fault jump:right:37s@0s")
-    assert outcome.code == 1
-    assert "found 37.000 s (37 s: TAI - UTC)" in outcome.err
-    assert "--align-clocks" in outcome.err
-
-
 def test_an_epoch_in_the_rig_makes_them_comparable(shell: Shell, tmp_path: Path) -> None:
     one = Unit()
     tai = twin(replace(one, begin_ns=one.begin_ns + 37 * NS_PER_S, host_ns=-37 * NS_PER_S), 222)
@@ -151,9 +144,3 @@ def test_aligned_clocks_give_the_scans_of_synchronised_ones(
         assert np.abs(one - expected).max() < 500_000
     report = json.loads((tmp_path / "mapped" / "report.json").read_text())
     assert any("aligned to" in note for note in report["sensors"][1]["clock"]["notes"])
-
-
-def test_mistakes(shell: Shell) -> None:
-    outcome = shell(f"convert {RECORDING} --dry-run --align-clocks --align-to second")
-    assert outcome.code == 2
-    assert "--align-to: expected host or first, found 'second'" in outcome.err

@@ -81,30 +81,6 @@ def test_lidars_without_a_common_window_are_refused(shell: Shell, tmp_path: Path
     assert "no scan: expected a whole window of 100 ms" in outcome.err
 
 
-@pytest.mark.parametrize("option", ["--tolerance", "--timeout"])
-@pytest.mark.parametrize("text", ["0", "-1", "inf", "nan", "soon"])
-def test_times_are_seconds_above_0(shell: Shell, option: str, text: str) -> None:
-    outcome = shell("compare", CAPTURE, f"{option}={text}")
-    assert (outcome.code, outcome.out) == (2, "")
-    assert outcome.err == (
-        f"mlbatch: error: {option}: expected seconds above 0, found {text!r}; write 0.05\n"
-    )
-
-
-@pytest.mark.parametrize(
-    ("words", "code", "message"),
-    [
-        ("--clock wall", 2, "--clock: expected"),
-        ("--rate 0", 2, "--rate: "),
-        ("--rig none.yaml", 1, "none.yaml"),
-    ],
-)
-def test_mistakes_are_one_line(shell: Shell, words: str, code: int, message: str) -> None:
-    outcome = shell(f"compare {CAPTURE} {words}")
-    assert (outcome.code, outcome.out, outcome.err.count("\n")) == (code, "", 1)
-    assert message in outcome.err
-
-
 def test_latencies_of_the_fixture(shell: Shell) -> None:
     """Sweeps of 100 ms, 37 ms apart (SOURCE.md): a set is complete as its last sweep ends.
 
@@ -172,24 +148,3 @@ def test_figures_without_matplotlib(shell: Shell, monkeypatch: pytest.MonkeyPatc
         r"pip install 'mlbatch-lidar\[plot\]'\n",
         outcome.err,
     )
-
-
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        ("--figures file", "file: expected a folder for figures, found a file"),
-        ("--figures no/plots", "no/plots: expected an existing folder around it"),
-        ("--figures old", "old: expected no figures, found spans.pdf"),
-        ("--html no/run.html", "no/run.html: expected a page in an existing folder"),
-        ("--html file", "file: expected a new file or an earlier page"),
-    ],
-)
-def test_places_are_checked_first(
-    shell: Shell, monkeypatch: pytest.MonkeyPatch, words: str, message: str
-) -> None:
-    Path("file").write_text("x")
-    Path("old").mkdir()
-    Path("old/spans.pdf").touch()
-    outcome = shell(f"compare none.pcap {words}")
-    assert (outcome.code, outcome.out, outcome.err.count("\n")) == (1, "", 1)
-    assert message in outcome.err

@@ -203,14 +203,6 @@ def test_sets_keep_their_numbers_where_others_have_no_poses(shell: Shell, output
     assert verified.code == 0, verified.out
 
 
-def test_a_trajectory_of_another_time_is_an_error(shell: Shell) -> None:
-    trajectory("old.tum", 1000, 1005, 1.0, 0.0)
-    done = shell(f"{WORDS} -o out --deskew old.tum")
-    assert done.code == 1
-    assert "expected poses at the times of the scans for --deskew, found 101 poses" in done.err
-    assert not Path("out").exists()
-
-
 @pytest.mark.parametrize(
     "output",
     ["out.mcap", "out.bag --stamp middle", "out --format ply", "out --format las", "out -f kitti"],
@@ -225,31 +217,6 @@ def test_every_format_can_be_checked_and_read(shell: Shell, output: str) -> None
     assert shell(f"{WORDS} -o moved --deskew turn.tum --deskew-to middle").code == 0
     for scan, name in zip(mlbatch.read(path), names("moved"), strict=True):
         np.testing.assert_allclose(scan.xyz, arrays(f"moved/{name}")["xyz"], atol=6e-4)
-
-
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        ("--deskew-to end", "--deskew-to: expected --deskew, which moves points"),
-        ("--deskew constant-velocity --start +1", "expected the recording from its beginning"),
-        ("--deskew constant-velocity --batching latest", "expected windows, which follow"),
-        ("--deskew imu --clock host", "--deskew imu: expected the clocks of the sensors"),
-        ("--deskew none.tum", "--deskew: expected imu, constant-velocity or the file"),
-        ("--deskew imu --deskew-to now", "--deskew-to: expected start or middle or end"),
-    ],
-)
-def test_options_without_a_meaning(shell: Shell, words: str, message: str) -> None:
-    done = shell(f"{WORDS} -o out {words}")
-    assert done.code == 2
-    assert message in done.err
-
-
-def test_an_imu_that_is_not_recorded_gives_no_poses(shell: Shell) -> None:
-    """The IMU packets of the recording are fewer than a second of a standstill."""
-    done = shell(f"{WORDS} -o out --deskew imu")
-    assert done.code == 1
-    assert "expected" in done.err
-    assert not Path("out").exists()
 
 
 @pytest.mark.parametrize(("x", "is_refused"), [(188, True), (-0.188, False)])

@@ -6,8 +6,6 @@ import json
 from pathlib import Path
 from typing import Any
 
-import pytest
-
 from tests.builders.sessions import FIXTURE, Shell
 
 Report = dict[str, Any]
@@ -100,21 +98,6 @@ def test_the_seed_chooses_the_packets(shell: Shell) -> None:
     first, second = (_report(shell, "drop:*:30%", more=f"--fault-seed {n}") for n in (0, 1))
     again = _report(shell, "drop:*:30%")
     assert _packets(first) == _packets(again) != _packets(second)
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ("--fault drop:lft:5%", "did you mean left?"),
-        ("--fault drop:left", "--fault: expected drop:SENSOR:VALUE, found 'drop:left'"),
-        ("--fault-seed -1", "--fault-seed: expected a whole number from 0, found -1; correct it"),
-    ],
-)
-def test_mistakes(shell: Shell, arguments: str, message: str) -> None:
-    outcome = shell(f"convert {RECORDING} --dry-run {arguments}")
-    assert outcome.code == 2
-    assert message in outcome.err
-    assert outcome.err.count("\n") == 1
 
 
 def test_many_late_columns_give_a_warning(shell: Shell) -> None:

@@ -17,7 +17,6 @@ import mlbatch
 from tests.builders.captures import udp_frame
 from tests.builders.sessions import (
     EPOCH_NS,
-    FIXTURE,
     Shell,
     Unit,
     arrays,
@@ -203,18 +202,6 @@ def test_limits_fail_after_the_output_is_complete(shell: Shell, capture: Path, w
         Path("out/report.json").unlink()
         lost = shell(f"convert {capture} --identity-extrinsics --resume {limits} {words}")
         assert (lost.code, "expected the report of the complete output" in lost.err) == (1, True)
-
-
-def test_limits_within_which_a_run_is_are_silent(shell: Shell) -> None:
-    words = f"{FIXTURE}/two_lidars.pcap --rig {FIXTURE}/rig.yaml -o out -q"
-    outcome = shell(f"convert {words} --fail-on loss>0%,underfilled>0,rejected>0,warnings>0")
-    assert (outcome.code, outcome.err) == (0, "")
-
-
-def test_a_wrong_limit_is_refused_before_anything_runs(shell: Shell, tmp_path: Path) -> None:
-    outcome = shell("convert none.pcap -o out --fail-on mood>0")
-    assert (outcome.code, "--fail-on: expected one of loss, " in outcome.err) == (2, True)
-    assert list(tmp_path.iterdir()) == []
 
 
 # -- scans without points -------------------------------------------------------------------------

@@ -139,26 +139,6 @@ def test_bytes_do_not_depend_on_jobs(shell: Shell) -> None:
     assert Path("one.mcap").read_bytes() == Path("two.mcap").read_bytes()
 
 
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        ("--batching latest --slices 5", "--slices: expected windows, found --batching latest"),
-        ("--batching latest --split", "--split: expected windows, found --batching latest"),
-        ("--batching best", "--batching: expected window, latest, approximate, collate"),
-        ("--batching latest --batching-times mine", "--batching-times: expected common, own"),
-        ("--batching-times own", "--batching-times: expected common for windows, found own"),
-        ("--batching latest --format kitti", "--batching: expected window for kitti"),
-        ("--stamp end", "--stamp: expected start for npz"),
-        ("--stamp first", "--stamp: expected start or middle or end"),
-    ],
-)
-def test_options_without_a_meaning(shell: Shell, words: str, message: str) -> None:
-    done = shell(f"{WORDS} -o out {words}")
-    assert done.code == 2
-    assert message in done.err
-    assert not Path("out").exists()
-
-
 # -- stamps ---------------------------------------------------------------------------------------
 
 

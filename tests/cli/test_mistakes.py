@@ -17,6 +17,7 @@ from tests.builders.sessions import (
     SMALL,
     Shell,
     Unit,
+    recording_shell,
     twin,
     write_metadata,
     write_session,
@@ -26,6 +27,7 @@ from tests.builders.transcripts import transcripts
 MISTAKES = transcripts("files")
 REAL_MISTAKES = transcripts("recordings")
 URLS = transcripts("urls")
+OPTIONS = transcripts("options", FIX="fix/two_lidars.pcap --rig fix/rig.yaml")
 UPTIME = Unit(begin_ns=1000 * NS_PER_S, host_ns=EPOCH_NS - 1000 * NS_PER_S)
 
 
@@ -117,6 +119,14 @@ def shell(
 @pytest.mark.parametrize("name", MISTAKES)
 def test_mistake(shell: Shell, place: Path, name: str) -> None:
     MISTAKES[name].check(shell, place)
+
+
+@pytest.mark.parametrize("name", OPTIONS)
+def test_options(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path, name: str
+) -> None:
+    (tmp_path / "fix").symlink_to(FIXTURE)
+    OPTIONS[name].check(recording_shell(monkeypatch, capsys, tmp_path), tmp_path)
 
 
 @pytest.mark.skipif(not RECORDINGS.is_dir(), reason=NO_RECORDINGS)

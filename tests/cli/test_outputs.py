@@ -198,27 +198,6 @@ def test_overwrite_replaces_the_scans_of_a_run_before(shell: Shell) -> None:
     assert Path("out/000000.npz").read_bytes() == before
 
 
-def test_a_report_may_lie_in_the_output_folder(shell: Shell) -> None:
-    assert shell(f"convert {FIX} -o out --report out/other.json").code == 0
-    assert names("out", ".json") == ["other.json"]
-    assert shell(f"convert {FIX} -o out --report out/third.json --overwrite").code == 0
-    assert names("out", ".json") == ["third.json"]
-
-
-def test_another_file_of_json_keeps_its_folder(shell: Shell) -> None:
-    assert shell(f"convert {FIX} -o out").code == 0
-    for text in ('{"schema": "mlbatch.rig/1"}', "[]", "", '{"title": "mlbatch.report/1"}'):
-        Path("out/notes.json").write_text(text)
-        outcome = shell(f"convert {FIX} -o out --overwrite")
-        assert outcome.code == 1
-        assert "found notes.json in it" in outcome.err
-
-
-def test_strict_is_silent_on_a_clean_recording(shell: Shell) -> None:
-    outcome = shell(f"convert {FIX} -o out --strict -q")
-    assert (outcome.code, outcome.out, outcome.err) == (0, "", "")
-
-
 def test_checksums_are_checked_on_wish(dry: Callable[[str], Report], tmp_path: Path) -> None:
     capture = write_session(tmp_path, Unit())
     raw = bytearray(capture.read_bytes())
@@ -270,25 +249,3 @@ def test_files_beside_an_output_are_no_recordings(shell: Shell, tmp_path: Path, 
     assert f"expected an output that does not overwrite {recording}, found one" in outcome.err
     assert recording.read_bytes() == CAPTURE.read_bytes()
     assert [path.name for path in tmp_path.iterdir()] == [recording.name]
-
-
-@pytest.mark.parametrize(
-    ("output", "report"),
-    [
-        *(("out.mcap", f"out.mcap{suffix}") for suffix in ("", ".partial", ".scans.csv")),
-        ("out.mcap", "out.mcap.partial.state"),
-        *(("out", f"out/{name}") for name in ("000003.npz", "scans.csv", "left/report.json")),
-        *(("out", name) for name in ("out", "out.partial", "out.old.partial")),
-    ],
-)
-def test_a_report_takes_the_place_of_no_output(shell: Shell, output: str, report: str) -> None:
-    outcome = shell(f"convert {FIX} -o {output} --report {report}")
-    assert outcome.code == 1
-    assert f"{report}: expected a report that is no file of the output, found one" in outcome.err
-    assert not Path(output).exists()
-
-
-def test_a_bag_is_not_read_where_it_is_replaced(shell: Shell) -> None:
-    assert shell(f"convert {FIX} -o bag --format rosbag2").code == 0
-    outcome = shell("convert bag/bag_0.mcap -o bag --format rosbag2 --overwrite")
-    assert (outcome.code, "does not overwrite bag/bag_0.mcap" in outcome.err) == (1, True)

@@ -79,34 +79,6 @@ def test_a_default_value_on_the_command_line_wins_as_well(shell: Shell, rig: Pat
     assert ", organized" not in shell("verify out.mcap").out
 
 
-@pytest.mark.parametrize(
-    ("line", "message"),
-    [
-        ("max_wait: -1", "convert.max_wait: --max-wait: expected seconds above 0, or inf"),
-        ("fail_on: [loses>1]", "convert.fail_on: --fail-on"),
-        ("decode: {crc: never}", "convert.decode: --decode crc: expected "),
-        ("start: yesterday", "convert.start: --start"),
-        ("jobz: 2", "convert.jobz: expected a key of "),
-    ],
-)
-def test_mistakes_are_one_line_with_their_place(
-    shell: Shell, rig: Path, line: str, message: str
-) -> None:
-    number = len(rig.read_text().splitlines()) + 3
-    _add(rig, f"  {line}\n")
-    outcome = shell(f"convert {CAPTURE} -r {rig} -o out")
-    assert (outcome.code, outcome.out) == (1, "")
-    assert outcome.err.count("\n") == 1
-    assert outcome.err.startswith(f"mlbatch: error: {rig}:{number}: {message}")
-
-
-def test_a_mistake_of_the_command_line_has_no_place(shell: Shell, rig: Path) -> None:
-    _add(rig, "  max_wait: 2\n")
-    outcome = shell(f"convert {CAPTURE} -r {rig} -o out --max-wait 0")
-    assert outcome.code == 2
-    assert outcome.err.startswith("mlbatch: error: --max-wait: expected seconds above 0")
-
-
 @pytest.mark.parametrize("command", ["inspect", "compare"])
 def test_other_commands_ignore_them(shell: Shell, rig: Path, command: str) -> None:
     before = shell(f"{command} {CAPTURE} -r {rig}")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -50,22 +49,6 @@ def test_every_format_can_be_checked(shell: Shell, output: str) -> None:
     assert shell(f"{WORDS} -o {output} --sort points --slices 3").code == 0
     verified = shell(f"verify {output.split()[0]}")
     assert verified.code == 0, verified.out
-
-
-def test_a_resumed_run_is_of_the_same_order(shell: Shell) -> None:
-    assert shell(f"{WORDS} -o whole --sort points").code == 0
-    assert shell(f"{WORDS} -o part --sort points --end +0.3").code == 0
-    for name in names("part"):
-        assert Path("part", name).read_bytes() == Path("whole", name).read_bytes()
-
-
-def test_organized_scans_have_no_order(shell: Shell) -> None:
-    outcome = shell(f"{WORDS} -o out --sort points --layout organized")
-    assert (outcome.code, outcome.err.count("\n")) == (2, 1)
-    assert "--sort points: expected a dense layout, found organized" in outcome.err
-    outcome = shell(f"{WORDS} -o out --sort rings")
-    assert (outcome.code, "expected columns or points, found 'rings'" in outcome.err) == (2, True)
-    assert not Path("out").exists()
 
 
 def test_points_in_python_are_sorted_as_well() -> None:

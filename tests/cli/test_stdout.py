@@ -95,12 +95,6 @@ def test_a_printed_rig_is_one_that_can_be_read(shell: Shell, tmp_path: Path) -> 
     ]
 
 
-def test_a_rig_and_json_cannot_both_be_printed(shell: Shell) -> None:
-    outcome = shell(f"inspect {CAPTURE} --write-rig - --json")
-    assert (outcome.code, outcome.out) == (2, "")
-    assert "expected standard output for the rig alone, found --json" in outcome.err
-
-
 def _stdin(monkeypatch: pytest.MonkeyPatch, text: str) -> None:
     monkeypatch.setattr("sys.stdin", io.TextIOWrapper(io.BytesIO(text.encode())))
 

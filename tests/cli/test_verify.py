@@ -7,7 +7,6 @@ import re
 from pathlib import Path
 
 import numpy as np
-import pytest
 
 from mlbatch.cli.verify import SHOWN
 from mlbatch.outputs.file_formats import FILE_FORMATS
@@ -70,14 +69,6 @@ def test_json(tmp_path: Path) -> None:
     assert by_name["grid"]["outcome"] == "ok"
     assert by_name["duplicates"]["outcome"] == "not checkable"
     assert "column" in by_name["duplicates"]["limit"]
-
-
-@pytest.mark.parametrize("name", ["nothing.mcap", "."])
-def test_nothing_to_check_is_one_line(name: str, tmp_path: Path) -> None:
-    result = command("verify", tmp_path / name)
-    assert (result.code, result.out) == (1, "")
-    assert len(result.err.splitlines()) == 1
-    assert "expected" in result.err
 
 
 def test_the_page_names_every_check() -> None:

@@ -228,17 +228,6 @@ def test_a_single_lidar_of_unknown_extrinsics_stays_in_its_own_frame(
     assert str(arrays("out/000000.npz")["frame_id"]) == "ouster_222"
 
 
-def test_an_existing_rig_file_is_kept(shell: Shell) -> None:
-    Path("rig.yaml").write_text("mine\n")
-    outcome = shell(f"inspect {CAPTURE} --write-rig rig.yaml")
-    assert (outcome.code, outcome.out) == (1, "")
-    assert outcome.err == (
-        "mlbatch: error: rig.yaml: expected a new rig file, found an existing one; choose another "
-        "name\n"
-    )
-    assert Path("rig.yaml").read_text() == "mine\n"
-
-
 def test_no_rig_is_written_of_nothing(shell: Shell, tmp_path: Path) -> None:
     capture = write_session(tmp_path, Unit(), metadata=False)
     outcome = shell(f"inspect {capture} --write-rig rig.yaml")
