@@ -258,15 +258,6 @@ def test_without_faults_nothing_changes(rng: random.Random) -> None:
     assert replayed(FaultReplay([], 3, NAMES), session, grouped(rng, 60)) == session
 
 
-@settings(max_examples=40)
-@given(RANDOM, st.integers(1, 200))
-def test_a_delay_of_all_changes_receive_times_only(rng: random.Random, delay_ms: int) -> None:
-    session = [one for one in packets(rng, 60) if one.sensor >= 0]
-    replay = FaultReplay([parse_fault(f"delay:*:{delay_ms}ms")], 0, NAMES)
-    later = [replace(one, host_ns=one.host_ns + delay_ms * MS) for one in session]
-    assert replayed(replay, session, grouped(rng, len(session))) == later
-
-
 def steady(count: int, sensors: int = 1) -> list[One]:
     """Sensors with a packet per millisecond."""
     return [

@@ -10,12 +10,11 @@ import pytest
 
 from mlbatch.arrays import I64Array
 from mlbatch.errors import UsageError
-from mlbatch.faults import FaultCount, FaultLedger, FaultReplay, parse_fault
+from mlbatch.faults import FaultCount, FaultReplay, parse_fault
 from mlbatch.types import Message, PacketBatch, Topic
+from tests.faults.test_laws import BEGIN_NS, MS, One, S, owner, replayed
+from tests.faults.test_laws import batches as batches_of
 
-MS = 10**6
-S = 10**9
-BEGIN_NS = 1_700_000_000 * S
 NAMES = ["left", "right"]
 
 
@@ -43,37 +42,22 @@ FEED: list[Seen] = [
 ]
 
 
-def batches(feed: Sequence[Seen], each: int) -> Iterator[PacketBatch]:
+def session(feed: Sequence[Seen]) -> list[One]:
+    """The packets of a feed."""
+    return [One(BEGIN_NS + at_ms * MS, sensor, payload) for at_ms, sensor, payload in feed]
+
+
+def batches(each: int) -> Iterator[PacketBatch]:
     """The feed in batches of `each` packets, in one buffer that is reused."""
-    data = np.zeros(64, np.uint8)
-    for at in range(0, len(feed), each):
-        part = feed[at : at + each]
-        payload = b"".join(one[2] for one in part)
-        data[:] = 0
-        data[: len(payload)] = np.frombuffer(payload, np.uint8)
-        size = np.array([len(one[2]) for one in part], np.int64)
-        host_ns = np.array([BEGIN_NS + one[0] * MS for one in part], np.int64)
-        sensor = np.array([one[1] for one in part], np.int64)
-        yield PacketBatch(data, np.cumsum(size) - size, size, sensor, host_ns)
+    return batches_of(session(FEED), [len(FEED[at : at + each]) for at in range(0, 7, each)])
 
 
-def owner(batch: PacketBatch) -> I64Array:
-    """Streams have the indices of sensors here."""
-    return batch.stream
-
-
-def replay(specs: str, each: int = 100, seed: int = 0) -> tuple[list[Seen], FaultReplay]:
+def replay(specs: str, each: int = 100) -> tuple[list[Seen], FaultReplay]:
     """The feed with faults (separated by blanks)."""
-    faults = FaultReplay([parse_fault(spec) for spec in specs.split()], seed, NAMES)
-    seen = []
-    for batch in faults.batches(batches(FEED, each), owner):
-        for start, size, stream, host_ns in zip(
-            batch.start, batch.size, batch.stream, batch.host_ns, strict=True
-        ):
-            late_ms, rest = divmod(int(host_ns) - BEGIN_NS, MS)
-            assert rest == 0
-            seen.append((late_ms, int(stream), batch.data[start : start + size].tobytes()))
-    return seen, faults
+    faults = FaultReplay([parse_fault(spec) for spec in specs.split()], 0, NAMES)
+    sizes = [len(FEED[at : at + each]) for at in range(0, len(FEED), each)]
+    found = replayed(faults, session(FEED), sizes)
+    return [((one.host_ns - BEGIN_NS) // MS, one.sensor, one.payload) for one in found], faults
 
 
 def without(*payloads: bytes) -> list[Seen]:
@@ -146,63 +130,18 @@ def test_a_moved_packet_without_a_next_one_is_last(each: int) -> None:
     assert [count.packets for count in faults.counts] == [1, 1]
 
 
-@pytest.mark.parametrize("each", [1, 3, 100])
-def test_copies_follow_the_original(each: int) -> None:
-    seen, faults = replay("dup:right:100%", each)
-    assert seen == [one for one in FEED for _ in range(2 if one[1] == 1 else 1)]
-    assert faults.ledgers == (FaultLedger(4, 0, 0, 4), FaultLedger(2, 0, 2, 4))
-
-
-@pytest.mark.parametrize("each", [1, 3, 100])
-def test_one_bit_flips(each: int) -> None:
-    seen, faults = replay("bitflip:left:100%", each)
-    assert [one[:2] for one in seen] == [one[:2] for one in FEED]
-    for (_, sensor, payload), (_, _, before) in zip(seen, FEED, strict=True):
-        difference = int.from_bytes(payload, "big") ^ int.from_bytes(before, "big")
-        assert difference.bit_count() == (1 if sensor == 0 else 0)
-    assert faults.counts == (FaultCount("bitflip:left:100%", 4),)
-
-
 @pytest.mark.parametrize("fault", ["bitflip", "truncate"])
 def test_hashes_of_damaged_payloads_are_not_known(fault: str) -> None:
-    hashed = (replace(one, content_key=np.arange(len(one))) for one in batches(FEED, 3))
+    hashed = (replace(one, content_key=np.arange(len(one))) for one in batches(3))
     faults = FaultReplay([parse_fault(f"{fault}:left:100%")], 0, NAMES)
     assert [one.content_key for one in faults.batches(hashed, owner)] == [None] * 3
-
-
-def test_two_faults_may_damage_the_same_packet() -> None:
-    """Each fault draws its own bit; copies of a damaged packet are equal."""
-    seen, _ = replay("bitflip:left:100% bitflip:left:100% dup:left:100%")
-    damaged = [payload for _, sensor, payload in seen if sensor == 0]
-    assert damaged[::2] == damaged[1::2]
-    flips = {
-        (int.from_bytes(now, "big") ^ int.from_bytes(before, "big")).bit_count()
-        for now, before in zip(damaged[::2], [b"a0", b"a1", b"a2", b"a3"], strict=True)
-    }
-    assert flips <= {0, 2}
-    assert 2 in flips
-
-
-@pytest.mark.parametrize("each", [1, 3, 100])
-def test_truncated_payloads_are_shorter_and_not_empty(each: int) -> None:
-    seen, faults = replay("truncate:right:100%", each)
-    # One of two bytes remains.
-    assert seen == [(ms, s, data[:1] if s == 1 else data) for ms, s, data in FEED]
-    assert faults.counts == (FaultCount("truncate:right:100%", 2),)
-
-
-def test_faults_are_applied_in_one_order() -> None:
-    """Removal is first: a packet moves behind the next one that remains."""
-    seen, faults = replay("reorder:left:100% stall:left:5ms-15ms")
-    assert [data for _, sensor, data in seen if sensor == 0] == [b"a2", b"a0", b"a3"]
-    assert [count.packets for count in faults.counts] == [1, 1]
 
 
 def test_messages_stay_in_their_batches_in_order() -> None:
     """Also where a batch has no packet left."""
     topic = Topic("/imu", "sensor_msgs/Imu", "cdr")
     source = []
-    for number, batch in enumerate(batches(FEED, 2)):
+    for number, batch in enumerate(batches(2)):
         batch.data = batch.data.copy()
         batch.messages = (Message(topic, number, b""), Message(topic, number, b"x"))
         source.append(batch)
@@ -215,7 +154,7 @@ def test_messages_stay_in_their_batches_in_order() -> None:
 
 
 def test_the_batch_of_the_reader_is_not_changed() -> None:
-    batch = next(batches(FEED, 100))
+    batch = next(batches(100))
     batch.data.flags.writeable = False
     for array in (batch.start, batch.size, batch.stream, batch.host_ns):
         array.flags.writeable = False
@@ -229,7 +168,7 @@ def test_times_count_from_the_first_packet_of_a_sensor() -> None:
     start, size, stream, host_ns = (np.array([one]) for one in (0, 8, -1, BEGIN_NS - 50 * MS))
     first = PacketBatch(np.zeros(8, np.uint8), start, size, stream, host_ns)
     faults = FaultReplay([parse_fault("late:left:10ms")], 0, NAMES)
-    given = faults.batches(iter([first, *batches(FEED, 100)]), owner)
+    given = faults.batches(iter([first, *batches(100)]), owner)
     assert sum(len(batch) for batch in given) == 1 + 6
     assert faults.begin_ns == BEGIN_NS
 
@@ -248,13 +187,6 @@ def test_a_clock_step_shifts_later_packets() -> None:
     assert faults.shift_ns(0, at_ms(0, 19, 20, 21)).tolist() == [0, 0, -37 * S, -37 * S]
     assert faults.shift_ns(1, at_ms(0, 20)).tolist() == [0, 0]
     assert faults.counts == (FaultCount("jump:left:-37s@20ms", 2),)
-
-
-def test_a_drift_grows_with_time() -> None:
-    _, faults = replay("drift:*:50ppm")
-    # 50 microseconds per second: 0.5 microseconds after 10 ms, 3 ms after a minute.
-    for sensor in (0, 1):
-        assert faults.shift_ns(sensor, at_ms(0, 10, 60_000)).tolist() == [0, 500, 3 * MS]
 
 
 def test_shifts_add_up() -> None:
