@@ -23,7 +23,7 @@ from mlbatch.simulate.robosense import encode as robosense
 from mlbatch.simulate.velodyne import encode as velodyne
 from tests.builders import two_lidars
 from tests.builders.captures import udp_frame, write_pcap
-from tests.builders.encoded import listed
+from tests.builders.lidar_packets import listed
 from tests.builders.scene import hall
 from tests.builders.seen import (
     Eye,

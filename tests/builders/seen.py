@@ -16,7 +16,7 @@ from mlbatch.simulate.hesai.angles import Beams
 from mlbatch.simulate.robosense import encode as robosense
 from mlbatch.simulate.velodyne import encode as velodyne
 from tests.builders import two_lidars
-from tests.builders.encoded import Payloads, encoded, firing_ns
+from tests.builders.lidar_packets import Payloads, encoded, firing_ns
 from tests.builders.scene import Scene
 
 # Behind a near surface every third column sees another one, as a beam does that an edge cuts.

@@ -48,11 +48,11 @@ class _Sorted:
 class Expected:
     """Makes the points of scans of these sensors, in the order of `lidar_id`."""
 
-    def __init__(self, seen: Sequence[Seen], *, keep_repeated: bool = False) -> None:
+    def __init__(self, seen: Sequence[Seen]) -> None:
         self._sensors = []
         ring_base = 0
         for sight in seen:
-            self._sensors.append(_sorted(sight, ring_base, keep_repeated))
+            self._sensors.append(_sorted(sight, ring_base))
             ring_base += sight.channels
 
     def points(self, sensor: I64Array, column: I64Array) -> Points:
@@ -107,11 +107,9 @@ def pair_types(counts: I64Array, level: I64Array) -> npt.NDArray[np.uint8]:
     return types.astype(np.uint8)
 
 
-def _sorted(sight: Seen, ring_base: int, keep_repeated: bool) -> _Sorted:
+def _sorted(sight: Seen, ring_base: int) -> _Sorted:
     """By firing, then channel, then return (docs/formats.md)."""
-    keep = sight.counts > 0
-    if not keep_repeated:
-        keep &= ~repeated(sight.counts)
+    keep = (sight.counts > 0) & ~repeated(sight.counts)
     fires_ns = np.repeat(sight.firing_ns, sight.returns, axis=1)
     order = np.argsort(fires_ns, axis=1, kind="stable")
     ring = ring_base + np.arange(sight.channels).repeat(sight.returns)

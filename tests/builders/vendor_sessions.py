@@ -14,7 +14,7 @@ from mlbatch.simulate.robosense import encode as robosense
 from tests.builders import livox
 from tests.builders.bags import Body, Recorded
 from tests.builders.captures import udp_frame, write_pcap
-from tests.builders.encoded import Payloads, Spec, even
+from tests.builders.lidar_packets import Payloads, Spec, even
 from tests.builders.messages import Unit as Sender
 from tests.builders.messages import messages
 from tests.builders.sessions import Records, Unit

@@ -96,6 +96,7 @@ def _write_rigs(folder: Path) -> None:
         "topic": "{name: left, stream: {topic: /left/ouster/lidar}}",
         "frame": "{name: left, stream: {topic: /left/ouster/lidar_packets}, "
         "extrinsics: {frame: os_lft}}",
+        "host": "{name: roof, clock: {source: host}}",
         "one": "{name: left}",
         "both": "{name: left, stream: {topic: /left/ouster/lidar_packets, port: 7502}}",
         "points": "{name: imu, stream: {topic: /imu/data}}",

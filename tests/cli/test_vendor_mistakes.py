@@ -14,7 +14,7 @@ from mlbatch.simulate.robosense.encode import RobosenseSpec
 from mlbatch.simulate.velodyne.encode import VelodyneSpec, position_packets
 from mlbatch.simulate.velodyne.models import calibration_yaml
 from tests.builders.bags import Recorded
-from tests.builders.encoded import listed
+from tests.builders.lidar_packets import listed
 from tests.builders.livox import LivoxSpec
 from tests.builders.others import EE, filled
 from tests.builders.points import CLOUD, OUSTER, cloud_message

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 import struct
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -23,7 +23,6 @@ from tests.builders.run import TWO_LIDARS, Told, command, load, scan_files
 from tests.builders.sessions import NS_PER_MS, NS_PER_S, SMALL, Unit, twin
 from tests.builders.sessions_of_bags import (
     description,
-    frame_message,
     split_at,
     told,
     unit_messages,
@@ -75,14 +74,6 @@ def convert(output: Path, *words: str | Path) -> Made:
     done = command("convert", *words, "-o", output)
     assert done.code == 0, done.err
     return Made(done, output)
-
-
-def refused(*words: str | Path) -> str:
-    """The one line that a refused conversion says."""
-    done = command("convert", *words, "--dry-run")
-    assert (done.code, done.out) != (0, "")
-    (line,) = done.err.splitlines()
-    return line.removeprefix("mlbatch: error: ")
 
 
 @pytest.fixture(scope="module")
@@ -146,18 +137,6 @@ def test_split_files_may_be_given_one_by_one(plain: Made, tmp_path: Path) -> Non
     assert convert(tmp_path / "scans", *reversed(parts)).files == plain.files
 
 
-def test_without_transforms_it_is_refused(tmp_path: Path) -> None:
-    bag = write_mcap(tmp_path / "drive.mcap", told(without="tf_static"))
-    assert refused(bag) == (
-        "extrinsics unknown for left, right; required for every sensor when there are two or "
-        "more; give them in a rig file (--rig), /tf_static or metadata (ouster-sdk extrinsic), or "
-        "accept the body origin with --identity-extrinsics"
-    )
-    assert convert(tmp_path / "scans", bag, "--identity-extrinsics").warnings == [
-        ("identity_extrinsics", "")
-    ]
-
-
 @pytest.mark.parametrize(("x_m", "warns"), [(0.3, False), (0.3009, False), (0.35, True)])
 def test_a_contradicting_urdf_is_told(x_m: float, warns: bool, plain: Made, tmp_path: Path) -> None:
     messages = told()
@@ -218,30 +197,6 @@ def test_imu_messages_on_another_clock_are_dropped_with_one_warning(tmp_path: Pa
         "that of the scans\n"
     )
     assert imu_of(tmp_path / "scans.mcap") == []
-
-
-@pytest.mark.parametrize("by_rig", [False, True])
-def test_arrival_times_that_do_not_exist_are_refused(by_rig: bool, tmp_path: Path) -> None:
-    unit = Unit()
-    metadata, *packets = unit_messages(unit, "roof")
-    frame = Recorded(
-        "/roof/ouster/frames",
-        "hesai_ros_driver/UdpFrame",
-        packets[-1].log_ns,
-        frame_message(unit),
-    )
-    bag = write_rosbag2(tmp_path / "drive.db3", [metadata, frame])
-    options: Sequence[str | Path] = ["--clock", "host"]
-    if by_rig:
-        rig = tmp_path / "rig.yaml"
-        rig.write_text("sensors: [{name: roof, clock: {source: host}}]\n", encoding="utf-8")
-        options = ["--rig", rig]
-    assert refused(bag, *options) == (
-        "--clock host: sensor roof: expected the receive time of each packet, found only that of "
-        "whole messages on /roof/ouster/frames; use --clock sensor (in the rig: clock.source) "
-        "without --align-clocks, or record the packets with tcpdump"
-    )
-    assert convert(tmp_path / "scans", bag).report["sensors"][0]["packets"]["read"] == 96
 
 
 def test_arrival_times_of_single_packets_are_their_log_times(tmp_path: Path) -> None:

@@ -27,7 +27,7 @@ from mlbatch.simulate.velodyne.models import MODELS as VELODYNES
 from mlbatch.simulate.velodyne.models import calibration_yaml
 from mlbatch.types import Scan
 from tests.builders.captures import udp_frame, write_pcap
-from tests.builders.encoded import Payloads, hesai_unit
+from tests.builders.lidar_packets import Payloads, hesai_unit
 from tests.builders.run import Result, in_memory
 from tests.builders.scene import hall
 from tests.builders.seen import (

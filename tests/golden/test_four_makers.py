@@ -2,6 +2,7 @@
 
 Nothing expected comes from a decoder: stamps, ranges and firing times are those that the encoders
 put into the packets (`tests/builders/seen.py`); windows are those of `tests/reference/batching.py`.
+Organized scans, repeated returns and types: test_every_model.py, test_literal.py.
 Times within a packet are whole ns for these models; what Velodyne and ROBOSENSE packets say of
 themselves is cut to whole us, and that is the time that counts.
 """
@@ -19,12 +20,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from mlbatch.arrays import BoolArray, F64Array, I64Array
+from mlbatch.arrays import F64Array, I64Array
 from tests.builders.four_makers import FOLDER, HOUR_NS, PLACES, VELODYNE, arrivals, main, seen
 from tests.builders.run import Cloud, command, load, scan_files
 from tests.builders.scene import hall
 from tests.builders.seen import ASIDE_PER_M, Seen
-from tests.builders.seen_points import Expected, Points, pair_types, repeated
+from tests.builders.seen_points import Expected, Points
 from tests.reference.batching import FeedPacket, Outcome, Settings, Window, reference_scans
 
 PCAP = FOLDER / "four_makers.pcap"
@@ -103,18 +104,16 @@ def check_windows(converted: Run) -> None:
         assert np.array_equal(scan["column_stamp_ns"], stamps)
 
 
-def check_points(converted: Run, *, keep_repeated: bool = False, are_turned: bool = True) -> None:
+def check_points(converted: Run) -> None:
     """What each point is, when it was measured, where it lies, and the order of points."""
-    expected = Expected(sensors(), keep_repeated=keep_repeated)
+    expected = Expected(sensors())
     for path, window in zip(scan_files(converted.folder), converted.outcome.windows, strict=True):
         cloud = Cloud.of(path)
         expected_points = expected.points(*columns_of(window))
         check_cloud(cloud, expected_points)
         # On the very ray, but for the azimuth.
         away_m: F64Array = np.linalg.norm(cloud.xyz - expected_points.xyz_m, axis=1)
-        assert (
-            away_m < ASIDE_PER_M * expected_points.range_m + FLOAT32_AT_20_M
-        ).all() == are_turned
+        assert (away_m < ASIDE_PER_M * expected_points.range_m + FLOAT32_AT_20_M).all()
 
 
 def check_cloud(cloud: Cloud, expected_points: Points) -> None:
@@ -170,126 +169,12 @@ def test_every_point_lies_on_a_surface_of_the_scene(whole: Run) -> None:
     check_places(Cloud.of_all(whole.folder))
 
 
-def test_without_the_motion_of_the_rotor_points_are_off(whole: Run, tmp_path: Path) -> None:
-    """The firing times move points by more than the check allows; all else stays."""
-    moved = run(tmp_path / "out", "20", 1, "--keep-partial", "--decode", "firing_azimuth=off")
-    check_points(moved, are_turned=False)
-    for number in range(1, len(PLACES)):
-        one = Cloud.of_all(whole.folder).of_sensor(number)
-        other = Cloud.of_all(moved.folder).of_sensor(number)
-        step_m: F64Array = np.linalg.norm(one.xyz.astype(np.float64) - other.xyz, axis=1)
-        assert (step_m > 2 * ASIDE_PER_M * one.range_m).any(), NAMES[number]
-        # Within a firing sequence a rotor of 12.5 Hz turns by a quarter of a degree at most.
-        assert (step_m < 0.005 * one.range_m).all(), NAMES[number]
-
-
 def test_the_hour_passes_within_the_recording(whole: Run) -> None:
     for sight in sensors():
         assert sight.stamp_ns[0] < HOUR_NS < sight.stamp_ns[-1]
     stamps = Cloud.of_all(whole.folder).column_stamp_ns
     assert (np.diff(stamps) >= 0).all()
     assert int(stamps[-1] - stamps[0]) < 300_000_000
-
-
-def test_returns_that_are_sent_twice_are_counted(whole: Run, tmp_path: Path) -> None:
-    twice = run(tmp_path / "out", "20", 1, "--keep-partial", "--keep-repeated")
-    check_points(twice, keep_repeated=True)
-    check_places(Cloud.of_all(twice.folder))
-    for converted, is_kept in ((whole, False), (twice, True)):
-        for sensor, sight in zip(converted.report["sensors"], sensors(), strict=True):
-            again = int(repeated(sight.counts).sum())
-            points = sensor["points"]
-            assert points["repeated"] == (0 if is_kept else again)
-            assert points["slots"] == sight.counts.size
-            assert points["no_return"] == np.count_nonzero(sight.counts == 0)
-            left = np.count_nonzero(sight.counts) - (0 if is_kept else again)
-            assert points["written"] == left
-            assert points["range"] == points["box"] == 0
-    # Pairs that differ are there as well.
-    roof = sensors()[ROOF].counts
-    assert 500 < np.count_nonzero(roof[..., 0] != roof[..., 1]) < roof.size / 4
-
-
-def test_returns_have_their_types(tmp_path: Path) -> None:
-    grid = organized(tmp_path)
-    roof = sensors()[ROOF]
-    types = grid["return_type"][grid["column_lidar_id"] == ROOF]
-    expected_points = pair_types(roof.counts, roof.level)
-    expected_points[roof.counts == 0] = 0
-    # Equal returns are one, and the second of them is left out.
-    expected_points[repeated(roof.counts)] = 0
-    assert np.array_equal(types.reshape(expected_points.shape), expected_points)
-
-
-def organized(folder: Path, *words: str) -> dict[str, Any]:
-    """The whole recording as arrays of slots."""
-    made = run(folder / "grid", "20", 1, "--keep-partial", "--layout", "organized", *words)
-    scans = [load(path) for path in scan_files(made.folder)]
-    keys = [key for key, value in scans[0].items() if value.ndim]
-    start_ns = np.repeat(
-        [scan["start_ns"] for scan in scans], [len(scan["time_ns"]) for scan in scans]
-    )
-    # By sensor, not by column.
-    keys = [key for key in keys if key not in ("sensors", "fill")]
-    grid = {key: np.concatenate([scan[key] for scan in scans]) for key in keys}
-    return {**grid, "at_ns": grid["time_ns"] + start_ns[:, None]}
-
-
-@pytest.mark.parametrize("keep_repeated", [False, True])
-def test_organized_scans_hold_what_was_sent(
-    whole: Run, keep_repeated: bool, tmp_path: Path
-) -> None:
-    grid = organized(tmp_path, *(["--keep-repeated"] if keep_repeated else []))
-    widest = max(sight.channels * sight.returns for sight in sensors())
-    assert grid["range_m"].shape == (sum(len(sight.stamp_ns) for sight in sensors()), widest)
-    filled: BoolArray = ~np.isnan(grid["range_m"])
-    for number, sight in enumerate(sensors()):
-        rows = grid["column_lidar_id"] == number
-        check_slots({key: value[rows] for key, value in grid.items()}, sight, keep_repeated)
-    for key, empty in (("xyz", np.nan), ("intensity", np.nan), ("time_ns", 0), ("ring", 0)):
-        assert np.array_equal(
-            grid[key][~filled], np.full_like(grid[key][~filled], empty), equal_nan=key[0] in "xi"
-        )
-    if not keep_repeated:
-        dense = Cloud.of_all(whole.folder)
-        assert as_set(dense.xyz, dense.at_ns, dense.ring) == as_set(
-            grid["xyz"][filled], grid["at_ns"][filled], grid["ring"][filled]
-        )
-
-
-def check_slots(own: dict[str, Any], sight: Seen, keep_repeated: bool) -> None:
-    used = sight.channels * sight.returns
-    counts = sight.counts.copy()
-    if not keep_repeated:
-        counts[repeated(sight.counts)] = 0
-    range_m: F64Array = np.nan_to_num(own["range_m"]).astype(np.float64)
-    assert np.array_equal(np.rint(range_m[:, :used] / sight.unit_m), counts.reshape(-1, used))
-    assert not range_m[:, used:].any()
-    assert np.array_equal(own["column_stamp_ns"], sight.stamp_ns)
-    fires_ns = np.repeat(sight.firing_ns, sight.returns, axis=1)
-    kept = counts.reshape(-1, used) > 0
-    assert np.array_equal(own["at_ns"][:, :used][kept], fires_ns[kept])
-
-
-def as_set(*arrays: Any) -> list[bytes]:
-    """Rows of several arrays, in an order of their own."""
-    rows = np.column_stack([np.asarray(array, np.float64) for array in arrays])
-    return sorted(row.tobytes() for row in rows)
-
-
-def test_ledgers_balance(whole: Run) -> None:
-    report = whole.report
-    assert report["capture"]["frames"] == report["capture"]["datagrams"] + sum(
-        report["capture"]["skipped"].values()
-    )
-    for sensor, sight in zip(report["sensors"], sensors(), strict=True):
-        packets = sensor["packets"]
-        columns = sensor["columns"]
-        points = sensor["points"]
-        assert packets["read"] == packets["accepted"] == len(sight.payloads)
-        assert (packets["rejected"], packets["lost"], packets["reordered"]) == ({}, 0, 0)
-        assert columns["decoded"] == columns["written"] == len(sight.stamp_ns)
-        assert points.pop("slots") == sum(points.values())
 
 
 def test_streams_are_recognised_without_a_rig() -> None:

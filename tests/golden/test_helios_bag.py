@@ -26,7 +26,7 @@ from mlbatch.simulate.robosense.encode import (
     origins,
 )
 from tests.builders.bags import Recorded
-from tests.builders.encoded import Payloads
+from tests.builders.lidar_packets import Payloads
 from tests.builders.rosbag2 import Form, write_rosbag2
 from tests.builders.run import in_memory
 from tests.builders.sessions_of_bags import write_mcap

@@ -26,7 +26,7 @@ from mlbatch.simulate.robosense import models as robosense_models
 from mlbatch.simulate.velodyne import encode as velodyne
 from mlbatch.simulate.velodyne.models import MODELS as VELODYNES
 from mlbatch.simulate.velodyne.models import calibration_yaml
-from tests.builders.encoded import Payloads, Spec, even, hesai_unit
+from tests.builders.lidar_packets import Payloads, Spec, even, hesai_unit
 from tests.builders.loss import Came
 from tests.fuzz.decoding import sampled
 from tests.fuzz.framing import Part

@@ -19,7 +19,7 @@ from mlbatch.simulate.hesai.angles import angles_csv
 from mlbatch.simulate.ouster.encode import OusterSpec, encode_packets, metadata_json
 from mlbatch.simulate.robosense import encode as robosense
 from mlbatch.simulate.velodyne import encode as velodyne
-from tests.builders.encoded import Spec, encoded, firing_ns, shape
+from tests.builders.lidar_packets import Spec, encoded, firing_ns, shape
 
 NS_PER_S = 10**9
 NS_PER_MS = 10**6
