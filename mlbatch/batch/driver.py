@@ -4,43 +4,48 @@ from __future__ import annotations
 
 import contextlib
 import threading
-from collections.abc import Callable, Generator, Sequence
+from collections import deque
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
-from queue import Empty, SimpleQueue
+from functools import partial
+from queue import SimpleQueue
+from typing import Any, Protocol
 
 from mlbatch.batch.record import FAILED, SessionRecord
+from mlbatch.batch.status import SessionStatus
 from mlbatch.batch.task import Stop, Task, finished, run_session
-from mlbatch.errors import DiskFullError, Interrupted, MlbatchError, system_error
+from mlbatch.errors import (
+    DiskFullError,
+    ExportError,
+    Interrupted,
+    MlbatchError,
+    UsageError,
+    install_extra,
+    system_error,
+)
 
-SKIPPED = "skipped"
 # Requests to a store at the same time.
 _REQUESTS = 16
-
-
-@dataclass(frozen=True, slots=True)
-class Result:
-    """A session at the end of a batch; ran: not skipped."""
-
-    name: str
-    record: SessionRecord
-    ran: bool
-
-    @property
-    def failed(self) -> bool:
-        """Whether there is no output, or one beyond limits."""
-        return not self.record.is_done
-
-    @property
-    def word(self) -> str:
-        """State in the last table; failures of earlier runs, too, are failures."""
-        if self.failed:
-            return FAILED
-        return self.record.state if self.ran else SKIPPED
-
+_CONNECT_S = 10
 
 # Called after each session.
-Progress = Callable[[Result], None]
+Progress = Callable[[SessionStatus], None]
+# DiskFullError ends all sessions.
+Outcome = SessionStatus | DiskFullError
+Ended = Callable[[Outcome], None]
+
+
+class Executor(Protocol):
+    """Runs sessions; at_once: how many it is given."""
+
+    at_once: int
+
+    def begin(self, task: Task, ended: Ended) -> None:
+        """Begin a session; `ended` is called from another thread."""
+
+    def close(self) -> None:
+        """End the sessions that run in order: their outputs can be resumed."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -51,58 +56,74 @@ class Batch:
     fail_fast: bool = False
     retry_failed: bool = False
     scheduler: str = ""  # address of a Dask scheduler; "": threads of this process
-    progress: Progress = field(default=lambda result: None)
+    progress: Progress = field(default=lambda status: None)
 
-    def run(self, tasks: Sequence[Task]) -> list[Result]:
-        """Run what is missing or changed; the results in the order of the tasks.
+    def run(self, tasks: Sequence[Task]) -> list[SessionStatus]:
+        """Run what is missing or changed; the sessions in the order of the tasks.
 
-        With `fail_fast` sessions that were not begun have no result. Raises Interrupted, and
+        With `fail_fast` sessions that were not begun are left out. Raises Interrupted, and
         DiskFullError: then no other session is begun.
         """
-        results: dict[str, Result] = {}
-        left = []
+        found: dict[str, SessionStatus] = {}
+        left: deque[Task] = deque()
         for task, record in zip(tasks, _records(tasks), strict=True):
             if record is None or (self.retry_failed and not record.is_done):
                 left.append(task)
                 continue
-            results[task.session.name] = Result(task.session.name, record, ran=False)
-            self.progress(results[task.session.name])
+            found[task.session.name] = SessionStatus(task.session.name, record, is_earlier=True)
+            self.progress(found[task.session.name])
         try:
-            with contextlib.closing(self._results(left)) as found:
-                for result in found:
-                    results[result.name] = result
-                    self.progress(result)
+            self._run(left, found)
         except KeyboardInterrupt as err:
             raise Interrupted(
-                f"interrupted; {len(results)} of {len(tasks)} sessions have ended; "
+                f"interrupted; {len(found)} of {len(tasks)} sessions have ended; "
                 "the same command continues with the others"
             ) from err
         except DiskFullError as err:
             raise DiskFullError(
-                f"{err} ({len(results)} of {len(tasks)} sessions have ended)"
+                f"{err} ({len(found)} of {len(tasks)} sessions have ended)"
             ) from err
-        order = [task.session.name for task in tasks]
-        return [results[name] for name in order if name in results]
+        names = [task.session.name for task in tasks]
+        return [found[name] for name in names if name in found]
 
-    def _results(self, tasks: Sequence[Task]) -> Generator[Result, None, None]:
-        if not self.scheduler:
-            return _by_threads(tasks, self.workers, fail_fast=self.fail_fast)
-        from mlbatch.batch.cluster import by_dask
-
-        return by_dask(tasks, self.scheduler, fail_fast=self.fail_fast)
+    def _run(self, waiting: deque[Task], found: dict[str, SessionStatus]) -> None:
+        """Run sessions. A simple queue, since an interrupt may leave a lock of Python's taken."""
+        if not waiting:
+            return
+        executor: Executor = Threads(self.workers)
+        if self.scheduler:
+            # All at once, so that workers that join later get some; else one a thread.
+            executor = Dask(self.scheduler, None if self.fail_fast else len(waiting))
+        outcomes: SimpleQueue[Outcome] = SimpleQueue()
+        running = 0
+        try:
+            while waiting or running:
+                if waiting and running < executor.at_once:
+                    running += 1
+                    executor.begin(waiting.popleft(), outcomes.put)
+                    continue
+                outcome = outcomes.get()
+                running -= 1
+                if isinstance(outcome, DiskFullError):
+                    raise outcome
+                found[outcome.name] = outcome
+                if self.fail_fast and outcome.is_failed:
+                    waiting.clear()
+                self.progress(outcome)
+        finally:
+            executor.close()
 
 
 def _records(tasks: Sequence[Task]) -> list[SessionRecord | None]:
     """Records of earlier runs that count."""
     if not any(task.is_remote for task in tasks):
-        return list(map(_before, tasks))
+        return list(map(_earlier, tasks))
     # Requests take their time in the network.
     with ThreadPoolExecutor(_REQUESTS) as pool:
-        return list(pool.map(_before, tasks))
+        return list(pool.map(_earlier, tasks))
 
 
-def _before(task: Task) -> SessionRecord | None:
-    """The record of an earlier run that counts."""
+def _earlier(task: Task) -> SessionRecord | None:
     try:
         return finished(task)
     except MlbatchError:
@@ -110,81 +131,89 @@ def _before(task: Task) -> SessionRecord | None:
         return None
 
 
-def failure(task: Task, err: Exception) -> Result:
-    """The result of a session that could not be run; it is not in its folder."""
+def _outcome(task: Task, run: Callable[[], SessionRecord]) -> Outcome:
+    """How a session ended; one that could not be run must not end the others."""
     name = task.session.name
-    if isinstance(err, OSError):
-        err = system_error(err)
-    line = str(err) if isinstance(err, MlbatchError) else f"{type(err).__name__}: {err}"
-    record = SessionRecord(name, FAILED, 1, line, {}, inputs=[*task.session.inputs])
-    return Result(name, record, ran=True)
-
-
-def _by_threads(
-    tasks: Sequence[Task], workers: int, *, fail_fast: bool
-) -> Generator[Result, None, None]:
-    """Results as they come, of threads that each wait for one process.
-
-    Simple queues, since an interrupt within `threading.Condition` may leave its lock taken.
-    """
-    stop = Stop()
-    closed = threading.Event()
-    waiting: SimpleQueue[Task] = SimpleQueue()
-    results: SimpleQueue[Result | DiskFullError | None] = SimpleQueue()
-
-    def work() -> None:
-        while not closed.is_set() and not waiting.empty():
-            try:
-                task = waiting.get_nowait()
-            except Empty:
-                break
-            try:
-                result = result_of(task, stop)
-            except DiskFullError as err:
-                closed.set()
-                results.put(err)
-                break
-            if result is not None:
-                if fail_fast and result.failed:
-                    closed.set()
-                results.put(result)
-        results.put(None)
-
-    for task in tasks:
-        waiting.put(task)
-    alive = min(workers, len(tasks))
-    threads = [threading.Thread(target=work, daemon=True) for _ in range(alive)]
     try:
-        # An interrupt may come while some have begun a session, and others were not started.
-        for thread in threads:
-            thread.start()
-        while alive:
-            result = results.get()
-            if result is None:
-                alive -= 1
-                continue
-            if isinstance(result, DiskFullError):
-                raise result
-            yield result
-    finally:
-        if alive:
-            # Sessions end in order: their outputs can be resumed.
-            closed.set()
-            stop.now()
-            # A thread that is not alive yet will find `closed`.
-            for thread in threads:
-                if thread.is_alive():
-                    thread.join()
-
-
-def result_of(task: Task, stop: Stop) -> Result | None:
-    """Run a session; None if it was interrupted. Raises DiskFullError, which ends the others."""
-    try:
-        return Result(task.session.name, run_session(task, stop), ran=True)
-    except Interrupted:
-        return None
-    except DiskFullError:
-        raise
+        return SessionStatus(name, run())
+    except DiskFullError as err:
+        return err
     except Exception as err:
-        # One session must not end the others.
-        return failure(task, err)
+        # Of Dask also KilledWorker: workers died several times with this session.
+        if isinstance(err, OSError):
+            err = system_error(err)
+        line = str(err) if isinstance(err, MlbatchError) else f"{type(err).__name__}: {err}"
+        # It is not in the folder of the session.
+        record = SessionRecord(name, FAILED, 1, line, {}, inputs=[*task.session.inputs])
+        return SessionStatus(name, record)
+
+
+class Threads:
+    """A thread for each session, which waits for its process."""
+
+    def __init__(self, at_once: int) -> None:
+        self.at_once = at_once
+        self._stop = Stop()
+        self._threads: list[threading.Thread] = []
+
+    def begin(self, task: Task, ended: Ended) -> None:
+        """Begin a session."""
+
+        def work() -> None:
+            ended(_outcome(task, partial(run_session, task, self._stop)))
+
+        self._threads = [one for one in self._threads if one.is_alive()]
+        self._threads.append(threading.Thread(target=work, daemon=True))
+        self._threads[-1].start()
+
+    def close(self) -> None:
+        """End the processes in order, and wait for them."""
+        self._stop.now()
+        for thread in self._threads:
+            # One that is not alive yet will find `stop`.
+            if thread.is_alive():
+                thread.join()
+
+
+class Dask:
+    """Tasks of a Dask scheduler that is already there.
+
+    If a worker dies, its scheduler gives the session to another one, which resumes it. Workers need
+    mlbatch, and the recordings and the output under the same paths.
+    """
+
+    def __init__(self, address: str, at_once: int | None) -> None:
+        """at_once: None: a session for each thread of the workers.
+
+        Raises UsageError without distributed, ExportError without a scheduler.
+        """
+        try:
+            from distributed import Client
+        except ImportError as err:
+            raise UsageError(
+                f"--scheduler: expected the package distributed, found none ({err}); "
+                f"{install_extra('dask')}"
+            ) from err
+        try:
+            self._client = Client(address, timeout=_CONNECT_S, set_as_default=False)
+        except (OSError, TimeoutError, ValueError) as err:
+            raise ExportError(
+                f"--scheduler {address}: expected a Dask scheduler, found none ({err}); start one "
+                "with `dask scheduler`, or leave out --scheduler"
+            ) from err
+        self.at_once = at_once or max(1, sum(self._client.nthreads().values()))
+        # The scheduler forgets a task that nobody refers to.
+        self._futures: list[Any] = []
+
+    def begin(self, task: Task, ended: Ended) -> None:
+        """Submit a session."""
+        # Not pure: what is in the output decides, not the arguments.
+        future = self._client.submit(run_session, task, pure=False)
+        self._futures.append(future)
+        future.add_done_callback(lambda future: ended(_outcome(task, future.result)))
+
+    def close(self) -> None:
+        """Begin no others; sessions that run end by themselves."""
+        with contextlib.suppress(Exception):
+            self._client.cancel([future for future in self._futures if not future.done()])
+            self._client.close()

@@ -7,19 +7,23 @@ their content. Of rigs and calibrations the whole content counts.
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
 
 import mlbatch
-from mlbatch.batch.session import Session, is_url
-from mlbatch.bounded import open_file, read_bytes
-from mlbatch.errors import MlbatchError, RecordingError
+from mlbatch.batch.session import Session, is_url, read_rig
+from mlbatch.discovery.calibrations import may_be_calibration
+from mlbatch.errors import RecordingError
+from mlbatch.pipeline.job_identity import content_of, files_of, whole_content
+
+if TYPE_CHECKING:
+    from mlbatch.rig.rig import Rig
 
 CONTENT = "content"
 TIMES = "times"
-_DIGITS = 16
-_END_BYTES = 1 << 16
-_BLOCKS = 16
 
 Key = dict[str, str]
 
@@ -29,36 +33,30 @@ def session_key(session: Session, cwd: Path) -> Key:
 
     Raises RecordingError where a recording does not exist.
     """
-    import numpy as np
-
-    local = [Path(one) for one in session.inputs if not is_url(one)]
-    files = [file for path in local for file in _files(path)]
-    sizes = [f"{file.name} {file.stat().st_size}" for file in files]
+    files = recordings_of(session)
+    stats = [(file.name, file.stat()) for file in files]
+    rig = read_rig(session.rig)
+    sizes = [f"{name} {one.st_size}" for name, one in stats]
     found = {
         "mlbatch": mlbatch.__version__,
         "numpy": np.__version__,
         "options": " ".join(session.key_words),
-        "recordings": "; ".join([*sizes, *_remote(session.inputs)]),
-        TIMES: "; ".join(str(file.stat().st_mtime_ns) for file in files),
-        "rig": "" if session.rig is None else _rig(session.rig),
-        "calibrations": _calibrations(local),
+        "recordings": "; ".join([*sizes, *_remote(list(filter(is_url, session.inputs)))]),
+        TIMES: "; ".join(str(one.st_mtime_ns) for _, one in stats),
+        "rig": "" if session.rig is None else _rig(session.rig, rig),
+        "calibrations": _calibrations(session),
     }
-    texts = _values(session, "--metadata")
+    texts = session.values("metadata")
     found["metadata"] = "; ".join(f"{text} {_digest(cwd / text)}" for text in texts)
-    poses = _values(session, "--deskew") or _trajectories(session.rig)
+    poses = session.values("deskew", rig)
     if poses:
         found["trajectory"] = " ".join(_digest(cwd / text) for text in poses)
     return found
 
 
 def content(session: Session) -> str:
-    """Digest of samples of the local recordings: start, end and blocks between."""
-    digest = hashlib.sha256()
-    for one in session.inputs:
-        for file in [] if is_url(one) else _files(Path(one)):
-            for sample in _samples(file):
-                digest.update(sample)
-    return digest.hexdigest()[:_DIGITS]
+    """Digest of samples of the local recordings."""
+    return content_of(recordings_of(session))
 
 
 def is_same(old: Mapping[str, str], new: Key, session: Session) -> bool:
@@ -68,92 +66,53 @@ def is_same(old: Mapping[str, str], new: Key, session: Session) -> bool:
     return old.get(TIMES) == new[TIMES] or old.get(CONTENT) == content(session)
 
 
-def changed(old: Mapping[str, str], new: Key) -> str:
-    """The names of what differs between two keys."""
-    return ", ".join(name for name, value in new.items() if old.get(name) != value)
+def recordings_of(session: Session) -> list[Path]:
+    """The local files of the recordings; RecordingError where one does not exist."""
+    found = []
+    for path in _local(session):
+        if not path.exists():
+            raise RecordingError(
+                f"{path}: expected a recording, found no such file; check the name"
+            )
+        found += files_of(path)
+    return found
 
 
-# -- files ------------------------------------------------------------------------------------
+def _local(session: Session) -> list[Path]:
+    return [Path(one) for one in session.inputs if not is_url(one)]
 
 
-def _files(path: Path) -> list[Path]:
-    """A recording, or all files of its folder."""
-    if path.is_dir():
-        return sorted(one for one in path.rglob("*") if one.is_file())
-    if not path.exists():
-        raise RecordingError(f"{path}: expected a recording, found no such file; check the name")
-    return [path]
+def _remote(urls: Sequence[str]) -> list[str]:
+    """Name, size and version of files in object storage, and of calibrations next to them."""
+    if not urls:
+        return []
+    from mlbatch.batch.remote import with_calibrations
 
-
-def _remote(inputs: Sequence[str]) -> Iterator[str]:
-    """Name, size and version of recordings in object storage, and of calibrations next to them."""
-    urls = [one for one in inputs if is_url(one)]
-    if urls:
-        from mlbatch.batch.remote import describe
-
-        yield from describe(urls)
-
-
-def _samples(file: Path) -> Iterator[bytes]:
-    size = file.stat().st_size
-    step = max((size - _END_BYTES) // _BLOCKS, _END_BYTES)
-    with open_file(file) as opened:
-        for start in (*range(0, size, step), max(size - _END_BYTES, 0)):
-            opened.seek(start)
-            yield opened.read(_END_BYTES)
+    return [f"{file.name} {file.size} {file.version}" for file in with_calibrations(urls)]
 
 
 def _digest(file: Path) -> str:
     try:
-        return hashlib.sha256(read_bytes(file)).hexdigest()[:_DIGITS]
-    except OSError:
+        return whole_content(file)
+    except RecordingError:
         # `convert` names what is wrong with it.
         return "unreadable"
 
 
-def _values(session: Session, name: str) -> list[str]:
-    """Values of an option of a session."""
-    return [value for one in session.options if one.name == name for value in one.values]
-
-
-def _trajectories(rig: str | None) -> list[str]:
-    """Values of --deskew in the options of a rig; files by their paths."""
-    if rig is None or is_url(rig):
-        return []
-    from mlbatch.rig.rig import read_rig
-
-    try:
-        options = read_rig(Path(rig)).options
-    except MlbatchError:
-        # `convert` names what is wrong with it.
-        return []
-    return [value for one in options if one.name == "deskew" for value in one.values]
-
-
-def _rig(rig: str) -> str:
+def _rig(text: str, rig: Rig | None) -> str:
     """Digests of a rig and of the calibrations that it names."""
-    if is_url(rig):
-        return "; ".join(_remote([rig]))
-    from mlbatch.rig.rig import read_rig
-
-    path = Path(rig)
-    try:
-        sensors = read_rig(path).sensors
-    except MlbatchError:
-        sensors = ()
+    if is_url(text):
+        return "; ".join(_remote([text]))
+    sensors = () if rig is None else rig.sensors
     calibrations = [sensor.metadata for sensor in sensors if sensor.metadata is not None]
     extrinsics = [file for sensor in sensors for file in sensor.extrinsics_files]
-    files = [path, *calibrations, *dict.fromkeys(extrinsics)]
-    return " ".join(_digest(file) for file in files)
+    return " ".join(map(_digest, (Path(text), *calibrations, *dict.fromkeys(extrinsics))))
 
 
-def _calibrations(recordings: list[Path]) -> str:
+def _calibrations(session: Session) -> str:
     """Digest of all files that may be calibrations in the folders of recordings."""
-    from mlbatch.discovery.calibrations import may_be_calibration
-
     digest = hashlib.sha256()
-    for folder in sorted({path.resolve().parent for path in recordings}):
-        for file in sorted(folder.iterdir()):
-            if may_be_calibration(file):
-                digest.update(f"{file.name} {_digest(file)}\n".encode(errors="surrogateescape"))
-    return digest.hexdigest()[:_DIGITS]
+    for folder in sorted({path.resolve().parent for path in _local(session)}):
+        for file in filter(may_be_calibration, sorted(folder.iterdir())):
+            digest.update(f"{file.name} {_digest(file)}\n".encode(errors="surrogateescape"))
+    return digest.hexdigest()[:16]

@@ -8,8 +8,8 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 
-from mlbatch.batch.session import Option, Session, check_name, check_unique, is_url
-from mlbatch.errors import RecordingError, RigError, UsageError
+from mlbatch.batch.session import Option, Session, check_name, check_unique, is_url, read_rig
+from mlbatch.errors import RecordingError, UsageError
 from mlbatch.readers.datasets import BAG_METADATA
 from mlbatch.rig.yaml_tree import Node, read_yaml
 
@@ -21,6 +21,7 @@ _FIELDS = re.compile(r"\{(\w*)\}")
 _TEMPLATE_WORDS = ("folder", "stem", "name")
 # Files of a folder that are recordings; gzip and zstd of them, too.
 _RECORDINGS = re.compile(r".*\.(pcap|pcapng|cap|mcap|bag|db3)(\.gz|\.zst|\.zstd)?", re.IGNORECASE)
+_SUFFIXES = re.compile(r"(?<=.)(\.(gz|zstd?|pcapng|pcap|cap|mcap|bag|db3))+$")
 # Not looked into before they are fetched: objects with these names are no recordings.
 _DOCUMENTS = re.compile(r".*\.(json|ya?ml|csv|dat|tum|txt|md|log|html)", re.IGNORECASE)
 # Names that a message shows.
@@ -80,29 +81,7 @@ def sessions_of(
         else:
             found += _of_pattern(source, "{stem}", given, source, say)
     check_unique(found)
-    formats = {rig: _format_of(rig) for rig in {one.rig for one in found}}
-    return tuple(_formatted(one, formats[one.rig]) for one in found)
-
-
-def _format_of(rig: str | None) -> str | None:
-    """The format in the options of a rig, which decides the name of the output."""
-    if rig is None or is_url(rig):
-        return None
-    from mlbatch.rig.rig import read_rig
-
-    try:
-        options = read_rig(Path(rig)).options
-    except RigError:
-        # `convert` names what is wrong with it.
-        return None
-    return next((one.values[-1] for one in options if one.name == "format"), None)
-
-
-def _formatted(session: Session, name: str | None) -> Session:
-    """The session with the format of its rig, unless it has one."""
-    if name is None or any(one.name == "--format" for one in session.options):
-        return session
-    return replace(session, options=(*session.options, Option("--format", (name,))))
+    return tuple(found)
 
 
 # -- patterns ---------------------------------------------------------------------------------
@@ -125,11 +104,7 @@ def _of_pattern(
             f"{where}: expected recordings or folders, found none for {pattern!r}; check the "
             "pattern"
         )
-    globs = {rig: _globs_of_sweeps(rig) for rig in {common.rig_of(match) for match in matches}}
-    found = [
-        (match, _inputs(match) or _folder_of_sweeps(match, globs[common.rig_of(match)]))
-        for match in matches
-    ]
+    found = [(match, _inputs(match, common.rig_of(match))) for match in matches]
     if not any(inputs for _, inputs in found):
         raise UsageError(
             f"{where}: expected recordings in what matches {pattern!r}, found none; check the "
@@ -139,27 +114,6 @@ def _of_pattern(
         if inputs:
             name = check_name(_named(template, match), where)
             yield common.session(name, inputs, match)
-
-
-def _globs_of_sweeps(rig: str | None) -> tuple[str, ...]:
-    """Patterns of a rig for files of sweeps; none of one that cannot be read, which fails later."""
-    if rig is None or is_url(rig):
-        return ()
-    from mlbatch.rig.rig import read_rig
-
-    try:
-        sensors = read_rig(Path(rig)).sensors
-    except RigError:
-        return ()
-    return tuple(sensor.sweeps.glob for sensor in sensors if sensor.sweeps is not None)
-
-
-def _folder_of_sweeps(match: str, globs: Sequence[str]) -> tuple[str, ...]:
-    """A folder with files of sweeps, as recording; or nothing."""
-    if is_url(match) or not Path(match).is_dir():
-        return ()
-    is_one = any(next(Path(match).glob(pattern), None) is not None for pattern in globs)
-    return (match,) if is_one else ()
 
 
 def _matches(pattern: str) -> list[str]:
@@ -192,42 +146,36 @@ def _may_be_recording(match: str) -> bool:
     return any(one.recognises(head) for one in readers())
 
 
-def _inputs(match: str) -> tuple[str, ...]:
+def _inputs(match: str, rig_name: str | None) -> tuple[str, ...]:
     """The recordings of a match: itself, or those of a folder; none: it has none."""
     if is_url(match):
         if not match.endswith("/"):
             return (match,)
         from mlbatch.batch.remote import inside
 
-        return tuple(url for url in inside(match) if _RECORDINGS.fullmatch(url))
+        return tuple(one.url for one in inside(match) if _RECORDINGS.fullmatch(one.url))
     path = Path(match)
     if not path.is_dir() or (path / BAG_METADATA).is_file():
         return (match,)
-    entries = sorted(path.iterdir())
-    return tuple(
+    found = tuple(
         str(entry)
-        for entry in entries
+        for entry in sorted(path.iterdir())
         if (_RECORDINGS.fullmatch(entry.name) and entry.is_file())
         or (entry / BAG_METADATA).is_file()
     )
+    rig = None if found else read_rig(rig_name)
+    sweeps = () if rig is None else [one.sweeps.glob for one in rig.sensors if one.sweeps]
+    is_of_sweeps = any(next(path.glob(pattern), None) is not None for pattern in sweeps)
+    return (match,) if is_of_sweeps else found
 
 
 def _named(template: str, match: str) -> str:
     """The name of a session: folder, stem (without suffixes of recordings) and name of a match."""
     path = PurePosixPath(match.rstrip("/"))
     is_folder = match.endswith("/") or (not is_url(match) and Path(match).is_dir())
-    stem = path.name
-    while not is_folder and (
-        cut := re.sub(r"\.(gz|zstd?|pcapng|pcap|cap|mcap|bag|db3)$", "", stem)
-    ):
-        if cut == stem:
-            break
-        stem = cut
-    words = {
-        "folder": path.name if is_folder else path.parent.name,
-        "stem": stem,
-        "name": path.name,
-    }
+    stem = path.name if is_folder else _SUFFIXES.sub("", path.name)
+    folder = path.name if is_folder else path.parent.name
+    words = {"folder": folder, "stem": stem, "name": path.name}
     return _FIELDS.sub(lambda found: words.get(found[1], found[0]), template)
 
 
@@ -352,12 +300,5 @@ def chosen(
                 f"--only: expected the name of a session, found {name!r}; the nearest is {nearest}"
             )
     number, count = part
-    mine = {session.name for session in sorted(sessions, key=_by_name)[number - 1 :: count]}
+    mine = sorted(names)[number - 1 :: count]
     return tuple(one for one in sessions if one.name in mine and (not only or one.name in only))
-
-
-def _by_name(session: Session) -> str:
-    return session.name
-
-
-__all__ = ["Common", "RigError", "chosen", "parse_part", "sessions_of"]

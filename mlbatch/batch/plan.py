@@ -5,8 +5,8 @@ from __future__ import annotations
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
+from mlbatch.batch.identity import recordings_of
 from mlbatch.batch.record import SessionRecord, read_record
 from mlbatch.batch.session import Session, is_url
 from mlbatch.batch.task import Task, finished
@@ -59,16 +59,16 @@ class Plan:
         return round(self.bytes_in * self.ratio)
 
     @property
-    def hours(self) -> float:
+    def seconds(self) -> float:
         """Time with all workers, as far as there are cores; of the longest session at least."""
         each_s = [self.start_s + (one.bytes or 0) / self.bytes_per_s for one in self.to_run]
         at_once = min(self.workers, self.cores)
-        return max(sum(each_s) / at_once, max(each_s, default=0.0)) / 3600
+        return max(sum(each_s) / at_once, max(each_s, default=0.0))
 
 
 def plan_of(tasks: Sequence[Task], workers: int, *, retry_failed: bool = False) -> Plan:
     """Look at all sessions; nothing is written."""
-    records = [read_record(task.folder) for task in tasks]
+    records = [read_record(task.upload or task.folder) for task in tasks]
     done = [record for record in records if record is not None and record.is_done]
     kept = [one for one in done if one.input_bytes and one.wall_s]
     bytes_in = sum(one.input_bytes for one in kept)
@@ -85,33 +85,23 @@ def plan_of(tasks: Sequence[Task], workers: int, *, retry_failed: bool = False) 
 
 
 def _planned(task: Task, record: SessionRecord | None, *, retry_failed: bool) -> PlannedSession:
-    session = task.session
-    size = _bytes(session)
-    count = len(session.inputs)
+    name, inputs = task.session.name, task.session.inputs
     try:
+        size = _bytes(task.session)
         same = finished(task)
     except MlbatchError as err:
-        return PlannedSession(session.name, "missing", count, size, str(err))
+        return PlannedSession(name, "missing", len(inputs), None, str(err))
     if same is not None and (same.is_done or not retry_failed):
-        return PlannedSession(session.name, same.state, count, size, same.line)
-    return PlannedSession(session.name, "missing" if record is None else "changed", count, size)
+        return PlannedSession(name, same.state, len(inputs), size, same.line)
+    return PlannedSession(name, "missing" if record is None else "changed", len(inputs), size)
 
 
-def _bytes(session: Session) -> int | None:
-    """Bytes of the recordings; None where one is missing."""
-    total = 0
-    for one in session.inputs:
-        if is_url(one):
-            from mlbatch.batch.remote import size_of
+def _bytes(session: Session) -> int:
+    """Bytes of the recordings; RecordingError where one is missing."""
+    total = sum(file.stat().st_size for file in recordings_of(session))
+    urls = list(filter(is_url, session.inputs))
+    if urls:
+        from mlbatch.batch.remote import head
 
-            size = size_of(one)
-            if size is None:
-                return None
-            total += size
-            continue
-        path = Path(one)
-        files = [path] if path.is_file() else [file for file in path.rglob("*") if file.is_file()]
-        if not files:
-            return None
-        total += sum(file.stat().st_size for file in files)
+        total += sum(head(url).size for url in urls)
     return total

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
+from typing import Any
 
 from mlbatch.batch.session import SESSION_JSON, STARTED_JSON
 from mlbatch.bounded import parse_json, read_text
@@ -46,20 +47,18 @@ class SessionRecord:
         return self.state == DONE
 
 
-def read_record(folder: Path) -> SessionRecord | None:
-    """The record of a session; None if there is none, or one of another version."""
-    return parse_record(_text(folder / SESSION_JSON))
+def read_record(place: Path | str) -> SessionRecord | None:
+    """The record in the folder of a session, or below its URL.
 
-
-def parse_record(text: str) -> SessionRecord | None:
-    """A record from its text; None for another text."""
+    None if there is none, or one of another version.
+    """
+    found = _document(place, SESSION_JSON)
+    if found.pop("schema", None) != SCHEMA:
+        return None
+    known = {one.name for one in fields(SessionRecord)}
     try:
-        found = parse_json(text)
-        if found.pop("schema") != SCHEMA:
-            return None
-        known = {one.name for one in fields(SessionRecord)}
         record = SessionRecord(**{key: value for key, value in found.items() if key in known})
-    except (ValueError, TypeError, KeyError, AttributeError):
+    except TypeError:
         return None
     is_valid = isinstance(record.key, dict) and record.state in (DONE, FAILED)
     return record if is_valid else None
@@ -72,13 +71,9 @@ def write_record(folder: Path, record: SessionRecord) -> None:
     (folder / STARTED_JSON).unlink(missing_ok=True)
 
 
-def read_started(folder: Path) -> dict[str, str] | None:
-    """The key of a run that has begun and not ended."""
-    try:
-        found = parse_json(_text(folder / STARTED_JSON))
-    except ValueError:
-        return None
-    return found if isinstance(found, dict) else None
+def read_started(folder: Path) -> dict[str, str]:
+    """The key of a run that has begun and not ended; empty without one."""
+    return _document(folder, STARTED_JSON)
 
 
 def write_started(folder: Path, key: dict[str, str]) -> None:
@@ -86,8 +81,15 @@ def write_started(folder: Path, key: dict[str, str]) -> None:
     write_text(folder / STARTED_JSON, json.dumps(key, indent=1, ensure_ascii=False) + "\n")
 
 
-def _text(path: Path) -> str:
+def _document(place: Path | str, name: str) -> dict[str, Any]:
+    """A file of a session; empty where there is none, or a damaged one."""
     try:
-        return read_text(path)
-    except (OSError, UnicodeDecodeError):
-        return ""
+        if isinstance(place, Path):
+            found = parse_json(read_text(place / name))
+        else:
+            from mlbatch.batch import remote
+
+            found = parse_json(remote.read_text(f"{place}/{name}"))
+    except (OSError, ValueError):
+        return {}
+    return found if isinstance(found, dict) else {}

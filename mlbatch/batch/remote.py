@@ -8,9 +8,11 @@ from __future__ import annotations
 
 import contextlib
 import fnmatch
+import hashlib
 import importlib
 import os
 import re
+import shutil
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -19,7 +21,14 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
-from mlbatch.errors import MlbatchError, RecordingError, UsageError, install_extra
+from mlbatch.errors import (
+    ExportError,
+    Interrupted,
+    MlbatchError,
+    RecordingError,
+    UsageError,
+    install_extra,
+)
 
 T = TypeVar("T")
 
@@ -27,19 +36,20 @@ _WILD = re.compile(r"[*?\[]")
 _WEB = ("http", "https")
 # Bytes of a request; one that fails is repeated, not the whole file.
 _BLOCK_BYTES = 8 << 20
-# Waits between attempts, s: a network that is cut for a minute is no failure.
 # Machines of the providers ask these for credentials, if the environment has none.
 _CREDENTIAL_HOSTS = ("169.254.169.254", "metadata.google.internal")
+# Waits between attempts, s: a network that is cut for a minute is no failure.
 _WAITS_S = (0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 30.0)
 _TIMEOUT = "60s"
 
 
 class RemoteFile(NamedTuple):
-    """A file of a store; version: changes with its content."""
+    """A file of a store; version: changes with its content; changed_ns: time of that."""
 
     url: str
     size: int
     version: str
+    changed_ns: int = 0
 
     @property
     def name(self) -> str:
@@ -136,8 +146,10 @@ def head(url: str) -> RemoteFile:
 
 
 def _remote_file(root: str, meta: Any, url: str = "") -> RemoteFile:
-    version = str(meta.get("e_tag") or meta.get("last_modified"))
-    return RemoteFile(url or f"{root}/{meta['path']}", int(meta["size"]), version)
+    changed = meta["last_modified"]
+    version = str(meta.get("e_tag") or changed)
+    changed_ns = int(changed.timestamp()) * 1_000_000_000
+    return RemoteFile(url or f"{root}/{meta['path']}", int(meta["size"]), version, changed_ns)
 
 
 def listed(url: str) -> list[RemoteFile]:
@@ -154,40 +166,29 @@ def listed(url: str) -> list[RemoteFile]:
     return sorted(_repeated(url, pages))
 
 
-def size_of(url: str) -> int | None:
-    """Bytes of a file; None without one."""
-    try:
-        return head(url).size
-    except RecordingError:
-        return None
-
-
-def describe(urls: Sequence[str]) -> Iterator[str]:
-    """Name, size and version of files, and of the calibrations next to them."""
+def with_calibrations(urls: Sequence[str]) -> list[RemoteFile]:
+    """Files, and the calibrations next to them."""
     files = [head(url) for url in urls]
-    near = {one.url: one for url in urls for one in calibrations(url)}
-    for file in (*files, *near.values()):
-        yield f"{file.name} {file.size} {file.version}"
+    near = [one for url in urls for one in calibrations(url)]
+    return list({one.url: one for one in (*files, *near)}.values())
 
 
 def calibrations(url: str) -> list[RemoteFile]:
     """Files in the folder of a recording that may be calibrations, as `convert` looks for them."""
     from mlbatch.discovery.calibrations import CALIBRATION_SUFFIXES, MAX_CALIBRATION_FILE_BYTES
 
-    folder = url.rpartition("/")[0]
     return [
         one
-        for one in listed(folder)
-        if one.url.rpartition("/")[0] == folder
-        and one.name.lower().endswith(CALIBRATION_SUFFIXES)
+        for one in inside(url.rpartition("/")[0])
+        if one.name.lower().endswith(CALIBRATION_SUFFIXES)
         and one.size <= MAX_CALIBRATION_FILE_BYTES
     ]
 
 
-def inside(url: str) -> list[str]:
-    """URLs of the files right in a folder."""
-    folder = url.rstrip("/")
-    return [one.url for one in listed(folder) if one.url.rpartition("/")[0] == folder]
+def inside(folder: str) -> list[RemoteFile]:
+    """The files right in a folder."""
+    folder = folder.rstrip("/")
+    return [one for one in listed(folder) if one.url.rpartition("/")[0] == folder]
 
 
 def matching(pattern: str) -> list[str]:
@@ -200,36 +201,84 @@ def matching(pattern: str) -> list[str]:
     wild = _WILD.search(pattern)
     folder = pattern[: wild.start() if wild else None].rpartition("/")[0]
     is_folder = pattern.endswith("/")
-    depth = pattern.rstrip("/").count("/")
+    expected = pattern.rstrip("/").split("/")
     found = set()
     for one in listed(folder):
         parts = one.url.split("/")
+        names = parts[: len(expected)]
         # A star does not match a slash.
-        name = "/".join(parts[: depth + 1])
-        if is_folder == (len(parts) > depth + 1) and _matches(name, pattern.rstrip("/")):
-            found.add(f"{name}/" if is_folder else name)
+        is_match = len(names) == len(expected) and all(map(fnmatch.fnmatchcase, names, expected))
+        if is_match and is_folder == (len(parts) > len(names)):
+            found.add("/".join(names) + "/" * is_folder)
     return sorted(found)
-
-
-def _matches(name: str, pattern: str) -> bool:
-    pairs = zip(name.split("/"), pattern.split("/"), strict=False)
-    return name.count("/") == pattern.count("/") and all(
-        fnmatch.fnmatchcase(one, part) for one, part in pairs
-    )
 
 
 # -- copies -----------------------------------------------------------------------------------
 
 
-def download(file: RemoteFile, target: Path) -> None:
-    """Copy a file here, in blocks; it appears complete or not at all.
+def default_cache() -> Path:
+    """`$MLBATCH_CACHE`, or the usual place of the user."""
+    named = os.environ.get("MLBATCH_CACHE")
+    if named:
+        return Path(named)
+    usual = os.environ.get("XDG_CACHE_HOME")
+    return (Path(usual) if usual else Path.home() / ".cache") / "mlbatch"
 
-    A copy that was interrupted continues, if the file has the same version.
+
+@contextlib.contextmanager
+def fetched(urls: Sequence[str], cache: Path, user: object) -> Iterator[dict[str, str]]:
+    """Paths of local copies of files, by URL; calibrations lie next to them. Removed at the end.
+
+    user: what they are for, of which there is one at a time. Those of an interrupted run stay for
+    the next one; other versions of the files have another folder.
+    """
+    files = with_calibrations(urls)
+    folder = cache / "inputs" / digest_of(user, *files)
+    copies = {file.url: _copy_in(folder, file.url) for file in files}
+    needed = sum(file.size for file in files if not copies[file.url].exists())
+    if needed:
+        folder.mkdir(parents=True, exist_ok=True)
+        free = shutil.disk_usage(folder).free
+        if free < needed:
+            raise ExportError(
+                f"{cache}: expected {needed} free bytes for {', '.join(urls)}, found {free}; give "
+                "another folder with --cache or $MLBATCH_CACHE"
+            )
+    for file in files:
+        if not copies[file.url].exists():
+            download(file, copies[file.url])
+    is_kept = False
+    try:
+        yield {url: str(copies[url]) for url in urls}
+    except (Interrupted, KeyboardInterrupt):
+        is_kept = True
+        raise
+    finally:
+        if not is_kept:
+            shutil.rmtree(folder, ignore_errors=True)
+
+
+def digest_of(*values: object) -> str:
+    """Values as the name of a folder."""
+    return hashlib.sha256(repr(values).encode(errors="surrogateescape")).hexdigest()[:16]
+
+
+def _copy_in(folder: Path, url: str) -> Path:
+    """Where a copy lies: those of one folder, and no others, next to each other."""
+    parent, _, name = url.rpartition("/")
+    return folder / digest_of(parent) / name
+
+
+def download(file: RemoteFile, target: Path) -> None:
+    """Copy a file here, in blocks; it appears complete or not at all, with its time of change.
+
+    A copy that was interrupted continues.
     """
     place = _place(file.url)
     import obstore
 
-    partial = target.with_name(f"{target.name}.{_plain(file.version)}.partial")
+    target.parent.mkdir(parents=True, exist_ok=True)
+    partial = target.with_name(f"{target.name}.partial")
     with partial.open("ab") as copy:
         at = copy.tell()
         while at < file.size:
@@ -242,6 +291,8 @@ def download(file: RemoteFile, target: Path) -> None:
         raise RecordingError(
             f"{file.url}: expected {file.size} bytes, found {at}; it changed meanwhile: try again"
         )
+    # A later copy is the same input to `convert --resume`.
+    os.utime(partial, ns=(file.changed_ns, file.changed_ns))
     partial.replace(target)
 
 
@@ -263,9 +314,7 @@ def local_output(name: str) -> Iterator[Path]:
         files = [head(url), *(one for one in listed(folder) if one.url.startswith(f"{url}."))]
     with tempfile.TemporaryDirectory(prefix="mlbatch-") as place:
         for file in files:
-            target = Path(place, file.url.removeprefix(f"{folder}/"))
-            target.parent.mkdir(parents=True, exist_ok=True)
-            download(file, target)
+            download(file, Path(place, file.url.removeprefix(f"{folder}/")))
         yield Path(place, url.rpartition("/")[2])
 
 
@@ -277,11 +326,6 @@ def _range(obstore: Any, place: _Place, at: int, length: int) -> Callable[[], by
         return data
 
     return read
-
-
-def _plain(version: str) -> str:
-    """A version as a part of a file name."""
-    return re.sub(r"\W", "", version)[:40]
 
 
 def upload(path: Path, url: str) -> None:

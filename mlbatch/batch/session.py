@@ -6,8 +6,12 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from mlbatch.errors import UsageError
+from mlbatch.errors import RigError, UsageError
+
+if TYPE_CHECKING:
+    from mlbatch.rig.rig import Rig
 
 SESSION_JSON = "session.json"
 # The key of a run that has begun; removed when session.json is there.
@@ -59,15 +63,21 @@ class Session:
         return replace(self, inputs=tuple(map(_absolute, self.inputs)), rig=rig)
 
     @property
-    def format(self) -> str:
-        """Output format."""
-        named = [one.values[-1] for one in self.options if one.name == "--format"]
-        return named[-1] if named else "mcap"
+    def urls(self) -> list[str]:
+        """Recordings and rig that are in a store."""
+        return [text for text in (*self.inputs, self.rig or "") if is_url(text)]
+
+    def values(self, name: str, rig: Rig | None = None) -> tuple[str, ...]:
+        """Values of an option of `convert`: those given, else those that the rig keeps."""
+        kept = {one.name: one.values for one in rig.options} if rig is not None else {}
+        given = {one.name.removeprefix("--"): one.values for one in self.options}
+        return (kept | given).get(name, ())
 
     @property
     def output(self) -> str:
-        """Name of the output in the folder of the session."""
-        return OUTPUT + _SUFFIX.get(self.format, "")
+        """Name of the output in the folder of the session; the format decides it."""
+        (name,) = self.values("format", read_rig(self.rig)) or ("mcap",)
+        return OUTPUT + _SUFFIX.get(name, "")
 
     @property
     def key_words(self) -> list[str]:
@@ -108,6 +118,18 @@ def is_url(text: str) -> bool:
 
 def _absolute(text: str) -> str:
     return text if is_url(text) else str(Path(text).absolute())
+
+
+def read_rig(rig: str | None) -> Rig | None:
+    """The rig of a session; None without one, in a store, or if `convert` will name a mistake."""
+    if rig is None or is_url(rig):
+        return None
+    from mlbatch.rig import rig as rigs
+
+    try:
+        return rigs.read_rig(Path(rig))
+    except RigError:
+        return None
 
 
 def own_files(folder: Path) -> list[Path]:

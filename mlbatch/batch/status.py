@@ -1,11 +1,13 @@
-"""The state of a batch, from the folders of its sessions."""
+"""The state of a batch, from the records of its sessions."""
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from fnmatch import fnmatch
 from pathlib import Path
 
-from mlbatch.batch.record import SessionRecord, parse_record, read_record
+from mlbatch.batch.record import DONE, FAILED, SessionRecord, read_record
 from mlbatch.batch.session import LOG_TXT, SESSION_JSON, STARTED_JSON, is_url
 from mlbatch.errors import RecordingError
 from mlbatch.report.report import CUT_OFF
@@ -15,20 +17,38 @@ CLOCK_CODES = frozenset(
     {"clocks", "clock_jump", "clock_epoch", "host_step", "timescale", "cloud_time"}
 )
 UNFINISHED = "unfinished"
+SKIPPED = "skipped"
+STATES = (DONE, FAILED, UNFINISHED)
+HEAD = ("session", "state", "scans", "lost", "fill", "clocks", "output", "time", "")
 
 
 @dataclass(frozen=True, slots=True)
 class SessionStatus:
-    """A session folder; record: None while session.json is not there."""
+    """A session; record: None while session.json is not there.
+
+    page: path of the page of its run, relative to the output; is_earlier: of an earlier run, that
+    counts.
+    """
 
     name: str
     record: SessionRecord | None
-    page: str = ""  # path of the page of the run, relative to the output
+    page: str = ""
+    is_earlier: bool = False
 
     @property
     def state(self) -> str:
         """done, failed or unfinished: running, or interrupted."""
         return UNFINISHED if self.record is None else self.record.state
+
+    @property
+    def word(self) -> str:
+        """State in the last table of a batch; failures of earlier runs, too, are failures."""
+        return SKIPPED if self.is_earlier and not self.is_failed else self.state
+
+    @property
+    def is_failed(self) -> bool:
+        """Whether there is no output, or one beyond limits."""
+        return self.state == FAILED
 
     @property
     def is_cut_off(self) -> bool:
@@ -44,6 +64,29 @@ class SessionStatus:
     def clock_codes(self) -> list[str]:
         """Warnings about clocks."""
         return [] if self.record is None else sorted(CLOCK_CODES & set(self.record.warnings))
+
+    @property
+    def loss(self) -> float:
+        """Share of the packets that were lost."""
+        return 0.0 if self.record is None else loss_of([self.record])
+
+    @property
+    def row(self) -> tuple[str, ...]:
+        """What a table shows, below `HEAD`."""
+        record = self.record
+        if record is None:
+            return (self.name, self.word, *[""] * (len(HEAD) - 2))
+        return (
+            self.name,
+            self.word,
+            str(record.scans or ""),
+            loss_text([record]),
+            "" if record.fill is None else f"{record.fill:.3f}",
+            ", ".join(self.clock_codes),
+            bytes_text(record.output_bytes) if record.outputs else "",
+            duration_text(record.wall_s),
+            self.reason,
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,48 +108,69 @@ class BatchStatus:
 
 def status_of(output: str) -> BatchStatus:
     """Read the state of a batch; RecordingError where there is none."""
-    if is_url(output):
-        return _remote_status(output)
-    folder = Path(output)
-    if not folder.is_dir():
-        raise RecordingError(
-            f"{folder}: expected the output of `mlbatch batch`, found no such folder; check the "
-            "name"
-        )
-    sessions = [found for path in sorted(folder.iterdir()) if (found := _session(path)) is not None]
+    root = output.rstrip("/") if is_url(output) else Path(output)
+    files = _files(root)
+    sessions = []
+    for name in sorted(files):
+        if files[name].isdisjoint((SESSION_JSON, STARTED_JSON, LOG_TXT)):
+            continue
+        pages = sorted(one for one in files[name] if fnmatch(one, "page*.html"))
+        record = read_record(root / name if isinstance(root, Path) else f"{root}/{name}")
+        sessions.append(SessionStatus(name, record, f"{name}/{pages[0]}" if pages else ""))
     if not sessions:
-        raise RecordingError(
-            f"{folder}: expected the output of `mlbatch batch`, found no session in it; check the "
-            "name"
-        )
-    return BatchStatus(output, tuple(sessions))
-
-
-def _remote_status(output: str) -> BatchStatus:
-    from mlbatch.batch.remote import listed, read_text
-
-    root = output.rstrip("/")
-    files = [one.url.removeprefix(f"{root}/").split("/") for one in listed(root)]
-    names = sorted({parts[0] for parts in files if parts[1:] in ([SESSION_JSON], [LOG_TXT])})
-    if not names:
         raise RecordingError(
             f"{output}: expected the output of `mlbatch batch`, found no session in it; check the "
             "name"
         )
-    pages = {parts[0]: "/".join(parts) for parts in files if parts[-1].startswith("page")}
-    sessions = [
-        SessionStatus(
-            name, parse_record(read_text(f"{root}/{name}/{SESSION_JSON}")), pages.get(name, "")
-        )
-        for name in names
-    ]
     return BatchStatus(output, tuple(sessions))
 
 
-def _session(folder: Path) -> SessionStatus | None:
-    names = (SESSION_JSON, STARTED_JSON, LOG_TXT)
-    if not any((folder / name).is_file() for name in names):
-        return None
-    pages = sorted(folder.glob("page*.html"))
-    page = f"{folder.name}/{pages[0].name}" if pages else ""
-    return SessionStatus(folder.name, read_record(folder), page)
+def _files(root: Path | str) -> Mapping[str, set[str]]:
+    """The names of the files in each folder of an output."""
+    found: dict[str, set[str]] = {}
+    if isinstance(root, str):
+        from mlbatch.batch.remote import listed
+
+        paths: Iterable[Sequence[str]] = (
+            one.url.removeprefix(f"{root}/").split("/") for one in listed(root)
+        )
+    elif root.is_dir():
+        paths = (path.relative_to(root).parts for path in root.glob("*/*"))
+    else:
+        raise RecordingError(
+            f"{root}: expected the output of `mlbatch batch`, found no such folder; check the name"
+        )
+    for parts in paths:
+        if len(parts) == 2:
+            found.setdefault(parts[0], set()).add(parts[1])
+    return found
+
+
+# -- figures as texts -------------------------------------------------------------------------
+
+
+def loss_of(records: Iterable[SessionRecord]) -> float:
+    """Share of the packets that were lost; 0 without packets."""
+    lost = sum(one.lost for one in records)
+    return lost / max(1, lost + sum(one.packets for one in records))
+
+
+def loss_text(records: Sequence[SessionRecord]) -> str:
+    """Share of the packets that were lost."""
+    return f"{100 * loss_of(records):.2f} %" if any(r.packets + r.lost for r in records) else ""
+
+
+def bytes_text(count: int) -> str:
+    """A size."""
+    for unit, size in (("TB", 1e12), ("GB", 1e9), ("MB", 1e6), ("kB", 1e3)):
+        if count >= size:
+            return f"{count / size:.1f} {unit}"
+    return f"{count} B"
+
+
+def duration_text(seconds: float) -> str:
+    """A time."""
+    if seconds < 120:
+        return f"{seconds:.1f} s"
+    minutes = round(seconds / 60)
+    return f"{minutes} min" if minutes < 120 else f"{minutes / 60:.1f} h"

@@ -9,14 +9,22 @@ from pathlib import Path
 from urllib.parse import quote
 
 import mlbatch
-from mlbatch.batch.record import SessionRecord
-from mlbatch.batch.status import UNFINISHED, BatchStatus, SessionStatus
+from mlbatch.batch.session import is_url
+from mlbatch.batch.status import (
+    HEAD,
+    UNFINISHED,
+    BatchStatus,
+    SessionStatus,
+    bytes_text,
+    duration_text,
+    loss_text,
+)
 from mlbatch.page import MARK, check_page, write_text_page
 
 _ORDER = {"failed": 0, UNFINISHED: 1, "done": 2}
-# Levels of loss in %, as in docs/page.md.
-_LOSS_WARNING = 0.1
-_LOSS_PROBLEM = 1.0
+# Levels of loss and fill, as in docs/page.md.
+_LOSS_WARNING = 0.001
+_LOSS_PROBLEM = 0.01
 _FILL_WARNING = 0.9
 _BADGES = {"failed": "problem", UNFINISHED: "warning", "done": "good"}
 _STYLE = """
@@ -80,19 +88,17 @@ def _header(title: str, status: BatchStatus) -> str:
 
 def _cards(status: BatchStatus) -> str:
     records = status.records
-    packets = sum(one.packets + one.lost for one in records)
-    lost = sum(one.lost for one in records)
     cards = {
         "done": f"{status.count('done'):,}",
         "failed": f"{status.count('failed'):,}",
         "unfinished": f"{status.count(UNFINISHED):,}",
         "cut off": f"{sum(one.is_cut_off for one in status.sessions):,}",
         "scans": f"{sum(one.scans for one in records):,}",
-        "lost packets": f"{100 * lost / packets:.3f} %" if packets else "",
+        "lost packets": loss_text(records),
         "sessions with clock trouble": f"{sum(bool(one.clock_codes) for one in status.sessions):,}",
-        "output": _gb(sum(one.output_bytes for one in records)),
-        "recorded": _duration(sum(one.recorded_s for one in records)),
-        "time of all sessions": _duration(sum(one.wall_s for one in records)),
+        "output": bytes_text(sum(one.output_bytes for one in records)),
+        "recorded": duration_text(sum(one.recorded_s for one in records)),
+        "time of all sessions": duration_text(sum(one.wall_s for one in records)),
     }
     items = "".join(
         f"<div class='card'><b>{escape(value)}</b><span>{escape(name)}</span></div>"
@@ -103,8 +109,7 @@ def _cards(status: BatchStatus) -> str:
 
 
 def _table(path: Path, status: BatchStatus, rows: list[SessionStatus]) -> str:
-    head = ("session", "state", "scans", "loss", "fill", "clocks", "output", "time", "")
-    cells = "".join(f"<th>{one}</th>" for one in head)
+    cells = "".join(f"<th>{one}</th>" for one in HEAD)
     lines = "".join(_row(path, status, one) for one in rows)
     return (
         "<section>\n<h2>Sessions</h2>\n<div class='scroll'><table>"
@@ -113,67 +118,27 @@ def _table(path: Path, status: BatchStatus, rows: list[SessionStatus]) -> str:
 
 
 def _row(path: Path, status: BatchStatus, one: SessionStatus) -> str:
-    record = one.record
-    name = escape(one.name)
+    cells = {head: escape(text) for head, text in zip(HEAD, one.row, strict=True)}
     if one.page:
-        name = f"<a href='{_link(path, status, one.page)}'>{name}</a>"
-    state = f"<span class='{_BADGES[one.state]}'><span class='badge'>{one.state}</span></span>"
-    cells = [name, state]
-    if record is None:
-        cells += [""] * 7
-    else:
-        cells += [
-            f"{record.scans:,}",
-            _loss(record),
-            _fill(record),
-            escape(", ".join(one.clock_codes)),
-            _gb(record.output_bytes),
-            _duration(record.wall_s),
-            _reason(one),
-        ]
-    return "<tr>" + "".join(f"<td>{cell}</td>" for cell in cells) + "</tr>"
+        cells["session"] = f"<a href='{_link(path, status, one.page)}'>{cells['session']}</a>"
+    badge = f"<span class='badge'>{one.state}</span>"
+    cells["state"] = f"<span class='{_BADGES[one.state]}'>{badge}</span>"
+    marks = {"lost": "warning" if one.loss >= _LOSS_WARNING else "", "fill": "", "": ""}
+    if one.loss >= _LOSS_PROBLEM:
+        marks["lost"] = "problem"
+    if one.record is not None and one.record.fill is not None and one.record.fill < _FILL_WARNING:
+        marks["fill"] = "warning"
+    if one.is_cut_off:
+        marks[""] = "problem"
+    for head, level in marks.items():
+        if level:
+            cells[head] = f"<strong class='{level}'>{cells[head]}</strong>"
+    return "<tr>" + "".join(f"<td>{cell}</td>" for cell in cells.values()) + "</tr>"
 
 
 def _link(path: Path, status: BatchStatus, page: str) -> str:
     """A page as seen from this one."""
-    if "://" in status.output:
-        return escape(quote(os.fsencode(page)), quote=True)
-    target = Path(status.output) / page
-    relative = os.path.relpath(target.resolve(), path.resolve().parent)
-    return escape(quote(os.fsencode(relative)), quote=True)
-
-
-def _loss(record: SessionRecord) -> str:
-    packets = record.packets + record.lost
-    if not packets:
-        return ""
-    percent = 100 * record.lost / packets
-    level = "problem" if percent >= _LOSS_PROBLEM else "warning"
-    text = f"{percent:.3f} %"
-    return text if percent < _LOSS_WARNING else f"<strong class='{level}'>{text}</strong>"
-
-
-def _fill(record: SessionRecord) -> str:
-    if record.fill is None:
-        return ""
-    text = f"{100 * record.fill:.1f} %"
-    return text if record.fill >= _FILL_WARNING else f"<strong class='warning'>{text}</strong>"
-
-
-def _reason(one: SessionStatus) -> str:
-    text = escape(one.reason)
-    return f"<strong class='problem'>{text}</strong>" if one.is_cut_off else text
-
-
-def _gb(count: int) -> str:
-    for unit, size in (("TB", 1e12), ("GB", 1e9), ("MB", 1e6)):
-        if count >= size:
-            return f"{count / size:.1f} {unit}"
-    return f"{count:,} B"
-
-
-def _duration(seconds: float) -> str:
-    if seconds < 120:
-        return f"{seconds:.1f} s"
-    minutes = round(seconds / 60)
-    return f"{minutes} min" if minutes < 120 else f"{minutes / 60:.1f} h"
+    if not is_url(status.output):
+        target = Path(status.output) / page
+        page = os.path.relpath(target.resolve(), path.resolve().parent)
+    return escape(quote(os.fsencode(page)), quote=True)

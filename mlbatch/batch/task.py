@@ -15,18 +15,16 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, BinaryIO
 
-from mlbatch.batch.cache import Cache
 from mlbatch.batch.identity import CONTENT, Key, content, is_same, session_key
 from mlbatch.batch.record import (
     DONE,
     FAILED,
     SessionRecord,
-    parse_record,
     read_record,
     read_started,
     write_record,
@@ -63,13 +61,14 @@ _POLL_S = 0.05
 class Task:
     """A session to run; cwd: that paths in options are relative to.
 
-    folder: of its output; upload: URL of the folder that the output is copied to, "" without.
+    folder: of its output; cache: for copies of remote files; upload: URL of the folder that the
+    output is copied to, "" without.
     """
 
     session: Session
     folder: Path
     cwd: Path
-    cache: Cache
+    cache: Path
     upload: str = ""
     retries: int = 1
     pages: bool = True
@@ -77,7 +76,39 @@ class Task:
     @property
     def is_remote(self) -> bool:
         """Whether its state or its recordings are in a store."""
-        return bool(self.upload) or any(map(is_url, self.session.inputs))
+        return bool(self.upload or self.session.urls)
+
+
+def tasks_of(
+    sessions: Sequence[Session], output: str, cache: Path, *, retries: int, pages: bool
+) -> list[Task]:
+    """The tasks of sessions; ExportError where the output cannot be one, UsageError for URLs."""
+    urls = [output] if is_url(output) else [url for one in sessions for url in one.urls]
+    folder = Path(output).absolute()
+    if urls:
+        from mlbatch.batch import remote
+
+        # Without the package every session would fail.
+        remote.check_package(urls[0])
+    if is_url(output):
+        # `convert` writes local files, which are uploaded in the end.
+        folder = cache / "outputs" / remote.digest_of(output)
+    if folder.exists() and not folder.is_dir():
+        raise ExportError(f"{folder}: expected a folder, found a file; choose another output")
+    upload = f"{output.rstrip('/')}/" if is_url(output) else ""
+    return [
+        Task(
+            # Workers have other working folders.
+            session=session.absolute(),
+            folder=folder / session.name,
+            cwd=Path.cwd(),
+            cache=cache,
+            upload=upload and upload + session.name,
+            retries=retries,
+            pages=pages,
+        )
+        for session in sessions
+    ]
 
 
 @dataclass(slots=True)
@@ -108,27 +139,21 @@ class Stop:
             for process in self._running:
                 process.terminate()
 
+    def check(self) -> None:
+        """Raise Interrupted after `now`."""
+        if self.event.is_set():
+            raise Interrupted("interrupted")
+
 
 def finished(task: Task) -> SessionRecord | None:
     """The record of a session whose inputs, options and versions did not change since."""
-    record = _earlier(task)
+    record = read_record(task.upload or task.folder)
     if record is None:
         return None
-    return (
-        record if is_same(record.key, session_key(task.session, task.cwd), task.session) else None
-    )
-
-
-def _earlier(task: Task) -> SessionRecord | None:
-    """The record of an earlier run whose outputs are there."""
-    if task.upload:
-        from mlbatch.batch.remote import read_text
-
-        return parse_record(read_text(f"{task.upload}/{SESSION_JSON}"))
-    record = read_record(task.folder)
-    if record is None or any(not (task.folder / name).exists() for name in record.outputs):
+    if not task.upload and any(not (task.folder / name).exists() for name in record.outputs):
         return None
-    return record
+    is_current = is_same(record.key, session_key(task.session, task.cwd), task.session)
+    return record if is_current else None
 
 
 def run_session(task: Task, stop: Stop | None = None) -> SessionRecord:
@@ -168,11 +193,11 @@ def _disk_full(folder: Path) -> DiskFullError:
 def _run_session(task: Task, stop: Stop) -> SessionRecord:
     session = task.session
     began_s = time.monotonic()
+    stop.check()
     try:
         key = session_key(session, task.cwd)
     except MlbatchError as err:
-        key = {}
-        failed = SessionRecord(session.name, FAILED, 1, str(err), key, inputs=[*session.inputs])
+        failed = SessionRecord(session.name, FAILED, 1, str(err), {}, inputs=[*session.inputs])
         task.folder.mkdir(parents=True, exist_ok=True)
         _publish(task, failed)
         return failed
@@ -198,23 +223,23 @@ def _run_session(task: Task, stop: Stop) -> SessionRecord:
             inputs=[*session.inputs],
             wall_s=round(time.monotonic() - began_s, 3),
         )
-        _add_figures(record, task)
+        _add_figures(record, task.folder)
         _publish(task, record)
         return record
 
 
 @contextlib.contextmanager
 def _staged(task: Task) -> Iterator[Task]:
-    """The task with local copies of remote files, kept while it runs."""
+    """The task with local copies of remote files, removed when it has ended."""
     session = task.session
-    urls = [one for one in (*session.inputs, session.rig or "") if is_url(one)]
-    if not urls:
+    if not session.urls:
         yield task
         return
-    with task.cache.staged(urls) as copies:
-        local = {url: str(path) for url, path in copies.items()}
-        inputs = tuple(local.get(one, one) for one in session.inputs)
-        rig = None if session.rig is None else local.get(session.rig, session.rig)
+    from mlbatch.batch.remote import fetched
+
+    with fetched(session.urls, task.cache, task.upload or task.folder) as copies:
+        inputs = tuple(copies.get(one, one) for one in session.inputs)
+        rig = None if session.rig is None else copies.get(session.rig, session.rig)
         yield replace(task, session=replace(session, inputs=inputs, rig=rig))
 
 
@@ -225,29 +250,25 @@ def _publish(task: Task, record: SessionRecord) -> None:
         return
     from mlbatch.batch import remote
 
+    record_url = f"{task.upload}/{SESSION_JSON}"
     # While files are replaced, nothing may say that they are complete.
-    remote.remove(f"{task.upload}/{SESSION_JSON}")
-    files = [path for path in _all_files(task.folder) if path.name != STARTED_JSON]
-    names = {path.relative_to(task.folder).as_posix() for path in files}
-    for path in files:
-        remote.upload(path, f"{task.upload}/{path.relative_to(task.folder).as_posix()}")
+    remote.remove(record_url)
+    mine = [path for path in own_files(task.folder) if path.name != STARTED_JSON]
+    files = {
+        f"{task.upload}/{path.relative_to(task.folder).as_posix()}": path
+        for top in mine
+        for path in (top, *top.rglob("*"))
+        if path.is_file()
+    }
+    for url, path in files.items():
+        remote.upload(path, url)
     for one in remote.listed(task.upload):
-        name = one.url.removeprefix(f"{task.upload}/")
-        if name not in names and OWN.fullmatch(name.partition("/")[0]):
+        top = one.url.removeprefix(f"{task.upload}/").partition("/")[0]
+        if one.url not in files and OWN.fullmatch(top):
             remote.remove(one.url)
     write_record(task.folder, record)
-    remote.upload(task.folder / SESSION_JSON, f"{task.upload}/{SESSION_JSON}")
-    for path in own_files(task.folder):
-        if path.name != LOG_TXT:
-            _remove(path)
-
-
-def _all_files(folder: Path) -> list[Path]:
-    """All files that a run wrote to the folder of a session."""
-    found = []
-    for path in own_files(folder):
-        found += [path] if path.is_file() else [one for one in path.rglob("*") if one.is_file()]
-    return found
+    remote.upload(task.folder / SESSION_JSON, record_url)
+    _clear(task.folder, kept=(LOG_TXT,))
 
 
 @contextlib.contextmanager
@@ -269,8 +290,8 @@ def _locked(folder: Path, stop: Stop) -> Iterator[BinaryIO]:
                         f"{folder}: expected no other run of this session, found one; wait for its "
                         "end"
                     ) from err
-                if stop.event.wait(_POLL_S):
-                    raise Interrupted("interrupted") from err
+                stop.event.wait(_POLL_S)
+                stop.check()
             except OSError:
                 # Some network file systems have no locks.
                 break
@@ -286,44 +307,39 @@ def _prepare(task: Task, key: Key) -> None:
                 f"{folder}: expected the folder of a session, found {path.name} in it; choose "
                 "another output or name"
             )
-    started = read_started(folder)
-    is_begun = started is not None and is_same(started, key, task.session)
-    kept = {LOG_TXT, STARTED_JSON}
-    if not is_begun:
+    if not is_same(read_started(folder), key, task.session):
         # session.json first: what is deleted must not look complete.
         (folder / SESSION_JSON).unlink(missing_ok=True)
-        for path in own_files(folder):
-            if path.name not in kept:
-                _remove(path)
+        _clear(folder, kept=(LOG_TXT, STARTED_JSON))
         write_started(folder, key | {CONTENT: content(task.session)})
 
 
-def _remove(path: Path) -> None:
-    if path.is_dir() and not path.is_symlink():
-        shutil.rmtree(path)
-    else:
-        path.unlink(missing_ok=True)
+def _clear(folder: Path, kept: Sequence[str]) -> None:
+    """Remove what a run wrote."""
+    for path in own_files(folder):
+        if path.name in kept:
+            continue
+        if path.is_dir() and not path.is_symlink():
+            shutil.rmtree(path)
+        else:
+            path.unlink(missing_ok=True)
 
 
 def _attempts(task: Task, log: BinaryIO, stop: Stop) -> tuple[int, int]:
     """Run the process until it ends; exit code and number of attempts."""
-    attempt = 0
-    code = 0
-    while attempt <= task.retries:
-        attempt += 1
+    attempts = 0
+    while True:
+        attempts += 1
         log.truncate(0)
         code = _run(words_of(task), task, log, stop)
-        if stop.event.is_set():
-            raise Interrupted("interrupted")
-        if code in _FINAL:
-            break
-    return code, attempt
+        stop.check()
+        if code in _FINAL or attempts > task.retries:
+            return code, attempts
 
 
 def _run(words: list[str], task: Task, log: BinaryIO, stop: Stop) -> int:
-    command = [sys.executable, "-m", "mlbatch.cli.child", *words]
     process = subprocess.Popen(
-        command,
+        [sys.executable, "-m", "mlbatch.cli.child", *words],
         stdin=subprocess.PIPE,
         stdout=log,
         stderr=log,
@@ -387,14 +403,15 @@ def _ended(code: int) -> str:
     return f"was ended by {name}{reason}"
 
 
-def _add_figures(record: SessionRecord, task: Task) -> None:
+def _add_figures(record: SessionRecord, folder: Path) -> None:
     """Sizes of inputs and outputs, and counts of the reports."""
-    outputs = [path for path in own_files(task.folder) if path.name.startswith("scans")]
-    record.outputs = [path.name for path in outputs]
-    record.output_bytes = sum(map(_size, outputs))
     fills = []
-    for path in own_files(task.folder):
-        if path.name.startswith("report") and path.suffix == ".json":
+    for path in own_files(folder):
+        if path.name.startswith("scans"):
+            record.outputs.append(path.name)
+            files = [path] if path.is_file() else path.iterdir()
+            record.output_bytes += sum(one.stat().st_size for one in files if one.is_file())
+        elif path.name.startswith("report") and path.suffix == ".json":
             with contextlib.suppress(OSError, ValueError, KeyError, TypeError):
                 fills += _add_report(record, parse_json(read_text(path)))
     record.fill = min(fills, default=None)
@@ -415,10 +432,3 @@ def _add_report(record: SessionRecord, report: dict[str, Any]) -> list[float]:
     codes = {one["code"] for one in report["warnings"]}
     record.warnings = sorted({*record.warnings, *codes})
     return [sensor["fill"] for sensor in report["sensors"] if sensor["fill"] is not None]
-
-
-def _size(path: Path) -> int:
-    """Bytes of a file, or of all files of a folder."""
-    if not path.is_dir():
-        return path.stat().st_size
-    return sum(one.stat().st_size for one in os.scandir(path) if one.is_file())

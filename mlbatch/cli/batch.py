@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-import sys
+import contextlib
+import itertools
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -12,11 +13,12 @@ from mlbatch import options
 from mlbatch.cli.parameters import parameter, with_parameters
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterator, Sequence
 
-    from mlbatch.batch.driver import Progress, Result
+    from mlbatch.batch.driver import Progress
     from mlbatch.batch.plan import Plan
     from mlbatch.batch.session import Option
+    from mlbatch.batch.status import SessionStatus
 
 # Options of `convert` that a batch has itself, or that have no meaning for many sessions.
 _OWN = ("output", "rig", "jobs", "only", "overwrite", "resume", "quiet", "verbose")
@@ -76,29 +78,28 @@ def batch(
         typer.Option(help="Dask scheduler to run the sessions, as tcp://HOST:8786.", metavar="URL"),
     ] = "",
     cache: Annotated[
-        Path | None, typer.Option(help="Folder for files of object storage.", metavar="DIR")
+        Path | None,
+        typer.Option(help="Folder for copies of files of object storage.", metavar="DIR"),
     ] = None,
-    cache_gb: Annotated[float, typer.Option(help="Largest size of the cache, GB.")] = 100.0,
+    cache_gb: Annotated[float | None, typer.Option(hidden=True)] = None,
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No table, no progress.")] = False,
     **values: Any,
 ) -> None:
     """Convert many sessions, a process each; a second run does what is missing or changed."""
-    from mlbatch.batch.cache import Cache
     from mlbatch.batch.driver import Batch
     from mlbatch.batch.manifest import Common, chosen, parse_part, sessions_of
     from mlbatch.batch.plan import plan_of
+    from mlbatch.batch.remote import default_cache
     from mlbatch.batch.session import is_url
-    from mlbatch.batch.store import tasks_of
+    from mlbatch.batch.task import tasks_of
     from mlbatch.cli import EXIT_LIMIT
     from mlbatch.cli.summary import say
     from mlbatch.pipeline.interrupts import interruptible
     from mlbatch.rig.rig import read_rig
 
     _check_counts(workers=workers, retries=retries)
-    if not cache_gb > 0:
-        from mlbatch.errors import UsageError
-
-        raise UsageError(f"--cache-gb: expected more than 0 GB, found {cache_gb}; write 100")
+    if cache_gb is not None:
+        say("--cache-gb is ignored, since copies are removed when their session has ended")
     jobs = _jobs(jobs, workers)
     numbers = parse_part(part)
     given = Common(rig, tuple(_given(context, values, jobs)))
@@ -106,14 +107,17 @@ def batch(
         # A mistake in it would fail every session.
         read_rig(Path(rig))
     sessions = chosen(sessions_of(sources, given, _kinds(), say), only or (), numbers)
-    copies = Cache.of(cache, cache_gb)
     with interruptible():
-        tasks = tasks_of(sessions, output, copies, retries=retries, pages=not no_pages)
+        tasks = tasks_of(
+            *(sessions, output, (cache or default_cache()).absolute()),
+            retries=retries,
+            pages=not no_pages,
+        )
         if plan:
             _print_plan(plan_of(tasks, workers, retry_failed=retry_failed))
             return
         with _progress(len(tasks), quiet=quiet) as progress:
-            results = Batch(
+            found = Batch(
                 workers=workers,
                 fail_fast=fail_fast,
                 retry_failed=retry_failed,
@@ -121,8 +125,8 @@ def batch(
                 progress=progress,
             ).run(tasks)
     if not quiet:
-        _print_table(results, len(tasks))
-    if any(result.failed for result in results):
+        print_status(found, ("done", "skipped", "failed"), len(tasks))
+    if any(one.is_failed for one in found):
         raise typer.Exit(EXIT_LIMIT)
 
 
@@ -183,85 +187,46 @@ with_parameters(batch, map(parameter, _FORWARDED.values()))
 # -- output -----------------------------------------------------------------------------------
 
 
-def _progress(count: int, *, quiet: bool) -> Any:
+@contextlib.contextmanager
+def _progress(count: int, *, quiet: bool) -> Iterator[Progress]:
     """A bar over the sessions with remaining time, on a terminal; failures as lines."""
-    import contextlib
+    from mlbatch.cli.progress import progress_bar
+    from mlbatch.cli.summary import say
 
-    from mlbatch.errors import one_line
+    with progress_bar("sessions", unit="sessions", is_shown=not quiet) as bar:
+        done = itertools.count(1)
 
-    def say(result: Result) -> None:
-        if result.failed and result.ran:
-            typer.echo(one_line(f"mlbatch: session {result.name}: {result.record.line}"), err=True)
+        def ended(one: SessionStatus) -> None:
+            if one.is_failed and not one.is_earlier:
+                say(f"session {one.name}: {one.reason}")
+            if bar is not None:
+                bar(next(done), count)
 
-    @contextlib.contextmanager
-    def shown() -> Iterator[Progress]:
-        if quiet or not sys.stderr.isatty():
-            yield say
-            return
-        from rich import progress
-        from rich.console import Console
-
-        with progress.Progress(
-            progress.TextColumn("{task.completed}/{task.total} sessions"),
-            progress.BarColumn(),
-            progress.TimeElapsedColumn(),
-            progress.TextColumn("ETA"),
-            progress.TimeRemainingColumn(elapsed_when_finished=False),
-            console=Console(stderr=True),
-            transient=True,
-        ) as bar:
-            task = bar.add_task("sessions", total=count)
-
-            def advance(result: Result) -> None:
-                say(result)
-                bar.advance(task)
-
-            yield advance
-
-    return shown()
+        yield ended
 
 
-def _print_table(results: list[Result], count: int) -> None:
+def print_status(sessions: Sequence[SessionStatus], words: Sequence[str], count: int) -> None:
+    """Print a table of sessions, and how many are in each state; count: with those not begun."""
+    from mlbatch.batch.status import HEAD
     from mlbatch.cli.tables import table_lines
-    from mlbatch.errors import one_line
 
-    head = ("session", "state", "scans", "lost", "fill", "output", "time", "")
-    rows = [
-        (
-            result.name,
-            result.word,
-            str(result.record.scans or ""),
-            percent_text(result.record.lost, result.record.packets + result.record.lost),
-            "" if result.record.fill is None else f"{result.record.fill:.3f}",
-            bytes_text(result.record.output_bytes) if result.record.outputs else "",
-            f"{result.record.wall_s:.1f} s" if result.ran else "",
-            result.record.line,
-        )
-        for result in results
-    ]
-    for line in table_lines([head, *rows]) if rows else ():
+    for line in table_lines([HEAD, *(one.row for one in sessions)]) if sessions else ():
         typer.echo(line)
-    words = [result.word for result in results]
-    counts = [f"{words.count(word)} {word}" for word in ("done", "skipped", "failed")]
-    not_begun = count - len(results)
-    tail = f", {not_begun} not begun (--fail-fast)" if not_begun else ""
-    typer.echo(one_line(f"{count} sessions: {', '.join(counts)}{tail}"))
+    found = [one.word for one in sessions]
+    counts = [f"{found.count(word)} {word}" for word in words]
+    if len(sessions) < count:
+        counts.append(f"{count - len(sessions)} not begun (--fail-fast)")
+    typer.echo(f"{count} sessions: {', '.join(counts)}")
 
 
 def _print_plan(plan: Plan) -> None:
+    from mlbatch.batch.status import bytes_text, duration_text
     from mlbatch.cli.tables import table_lines
 
     rows = [("session", "state", "recordings", "bytes", "")]
-    rows += [
-        (
-            one.name,
-            one.word,
-            str(one.inputs),
-            "?" if one.bytes is None else bytes_text(one.bytes),
-            one.problem,
-        )
-        for one in plan.sessions
-    ]
+    for one in plan.sessions:
+        size = "?" if one.bytes is None else bytes_text(one.bytes)
+        rows.append((one.name, one.word, str(one.inputs), size, one.problem))
     for line in table_lines(rows):
         typer.echo(line)
     source = (
@@ -270,22 +235,5 @@ def _print_plan(plan: Plan) -> None:
     typer.echo(
         f"{len(plan.to_run)} of {len(plan.sessions)} sessions to convert: "
         f"{bytes_text(plan.bytes_in)} in, about {bytes_text(plan.bytes_out)} out, "
-        f"about {_hours(plan.hours)} with {plan.workers} worker(s) ({source})"
+        f"about {duration_text(plan.seconds)} with {plan.workers} worker(s) ({source})"
     )
-
-
-def percent_text(part: int, whole: int) -> str:
-    """A share, for tables."""
-    return f"{100 * part / whole:.2f} %" if whole else ""
-
-
-def bytes_text(count: int) -> str:
-    """A size, for tables."""
-    for unit, size in (("TB", 1e12), ("GB", 1e9), ("MB", 1e6), ("kB", 1e3)):
-        if count >= size:
-            return f"{count / size:.1f} {unit}"
-    return f"{count} B"
-
-
-def _hours(hours: float) -> str:
-    return f"{hours:.1f} h" if hours >= 0.1 else f"{hours * 3600:.0f} s"

@@ -20,15 +20,15 @@ def batch_status(
     ] = None,
 ) -> None:
     """Show the sessions of a batch: state, loss, fill, clocks, bytes, time."""
-    from mlbatch.batch.status import status_of
+    from mlbatch.batch.status import STATES, status_of
+    from mlbatch.cli.batch import print_status
     from mlbatch.errors import one_line
 
     status = status_of(output)
     if as_json:
         typer.echo(json.dumps(_values(status), indent=1))
     elif page is None:
-        for line in _lines(status):
-            typer.echo(one_line(line))
+        print_status(status.sessions, STATES, len(status.sessions))
     if page is not None:
         from mlbatch.batch.status_page import write_status_page
 
@@ -39,10 +39,12 @@ def batch_status(
 def _values(status: BatchStatus) -> dict[str, object]:
     from dataclasses import asdict
 
+    from mlbatch.batch.status import STATES
+
     return {
         "schema": "mlbatch.status/1",
         "output": status.output,
-        "states": {state: status.count(state) for state in ("done", "failed", "unfinished")},
+        "states": {state: status.count(state) for state in STATES},
         "sessions": [
             {
                 "name": one.name,
@@ -54,30 +56,3 @@ def _values(status: BatchStatus) -> dict[str, object]:
             for one in status.sessions
         ],
     }
-
-
-def _lines(status: BatchStatus) -> list[str]:
-    from mlbatch.cli.batch import bytes_text, percent_text
-    from mlbatch.cli.tables import table_lines
-
-    rows = [("session", "state", "scans", "lost", "fill", "clocks", "output", "time", "")]
-    for one in status.sessions:
-        record = one.record
-        if record is None:
-            rows.append((one.name, one.state, "", "", "", "", "", "", ""))
-            continue
-        rows.append(
-            (
-                one.name,
-                one.state,
-                str(record.scans or ""),
-                percent_text(record.lost, record.packets + record.lost),
-                "" if record.fill is None else f"{record.fill:.3f}",
-                ", ".join(one.clock_codes),
-                bytes_text(record.output_bytes) if record.outputs else "",
-                f"{record.wall_s:.1f} s",
-                one.reason,
-            )
-        )
-    counts = [f"{status.count(state)} {state}" for state in ("done", "failed", "unfinished")]
-    return [*table_lines(rows), f"{len(status.sessions)} sessions: {', '.join(counts)}"]

@@ -78,16 +78,16 @@ def job_identity(job: Job, name: str, options: WriterOptions) -> dict[str, str]:
 def input_identity(run: Conversion) -> dict[str, str]:
     """Sizes, times and samples of the recordings, digests of calibrations and poses."""
     found = {}
-    recordings = [_files(path) for path in run.job.recordings]
+    recordings = [files_of(path) for path in run.job.recordings]
     total = sum(file.stat().st_size for files in recordings for file in files)
     for number, (path, files) in enumerate(zip(run.job.recordings, recordings, strict=True), 1):
         size_and_time = _size_and_time(files)
-        content = _content(files, total)
+        content = content_of(files, total)
         found[f"recording {number}"] = f"{path.name} ({size_and_time}, content {content})"
     for path in run.job.selection.metadata:
-        found[f"metadata {path.name}"] = _whole_content(path)
+        found[f"metadata {path.name}"] = whole_content(path)
     if run.job.deskew and Path(run.job.deskew).is_file():
-        found["trajectory"] = _whole_content(Path(run.job.deskew))
+        found["trajectory"] = whole_content(Path(run.job.deskew))
     for sensor in run.sensors:
         found[f"calibration of {sensor.name}"] = _calibration(sensor)
         pose = (sensor.body_from_sensor, sensor.clock.offset_ns)
@@ -166,7 +166,7 @@ def _text(value: object) -> str:
 # -- files ------------------------------------------------------------------------------------
 
 
-def _files(path: Path) -> list[Path]:
+def files_of(path: Path) -> list[Path]:
     """A recording, or all files of its folder."""
     return sorted(p for p in path.rglob("*") if p.is_file()) if path.is_dir() else [path]
 
@@ -178,7 +178,7 @@ def _size_and_time(files: Sequence[Path]) -> str:
     return f"{size} bytes, changed at {max((one.st_mtime_ns for one in stats), default=0)} ns"
 
 
-def _content(files: Sequence[Path], session_bytes: int) -> str:
+def content_of(files: Sequence[Path], session_bytes: int = 0) -> str:
     """Digest of samples of files; session_bytes: of all files that share the samples."""
     digest = hashlib.sha256()
     for file in files:
@@ -187,7 +187,7 @@ def _content(files: Sequence[Path], session_bytes: int) -> str:
     return digest.hexdigest()[:_DIGITS]
 
 
-def _whole_content(file: Path) -> str:
+def whole_content(file: Path) -> str:
     """Digest of a file that is read as a whole anyway: any byte of it may change points."""
     try:
         return hashlib.sha256(read_bytes(file)).hexdigest()[:_DIGITS]
@@ -232,7 +232,7 @@ def _calibration(sensor: Sensor) -> str:
     """Digest of a sensor's calibration: its file, if there is one, and what is made of it."""
     lidar = sensor.lidar
     path = Path(lidar.calibration)
-    content = _whole_content(path) if path.is_file() else ""
+    content = whole_content(path) if path.is_file() else ""
     # Copies in other folders are the same calibration.
     name = path.name if content else lidar.calibration
     return _digest((content, name, *(getattr(lidar, one) for one in _CALIBRATED)))

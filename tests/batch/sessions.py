@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import json
 import os
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -39,8 +40,9 @@ if "mlbatch.cli.child" in words:
             os.kill(os.getpid(), signal.SIGKILL)
         threading.Thread(target=kill, daemon=True).start()
 """
-RIG = "sensors: [{name: front, metadata: ../111.json}]\n"
 WAIT_S = 90.0
+
+Options = Mapping[str, str | bool]
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,27 +68,33 @@ class Dataset:
             mark.unlink()
 
 
-def write_dataset(folder: Path, names: list[str], turns: int = 3) -> Dataset:
-    """Sessions of one lidar, each with its own ranges; `hopeless*` is no recording."""
+def write_dataset(
+    folder: Path, names: Iterable[str], options: Mapping[str, Options] | None = None
+) -> Dataset:
+    """Sessions of one lidar, each with its own ranges; options: of `convert`, by session.
+
+    `hopeless*` is no recording, that of `cut*` ends early, and `segments*` is longer.
+    """
     for name in ("raw", "saboteur", "marks"):
         (folder / name).mkdir(parents=True)
+    lines = ["schema: mlbatch.batch/1", "options: {rate: 20}", "sessions:"]
     for number, name in enumerate(names):
+        own = json.dumps((options or {}).get(name, {}))
+        lines.append(f'  - {{glob: "raw/{name}/", name: "{{folder}}", options: {own}}}')
         if name.startswith("hopeless"):
             (folder / "raw" / name).mkdir()
             (folder / "raw" / name / "drive.pcap").write_text("no recording", encoding="utf-8")
             continue
         unit = replace(
-            Unit(SMALL, turns=turns, range_mm=4000 + 8 * number),
+            Unit(SMALL, turns=6 if name.startswith("segments") else 3, range_mm=4000 + 8 * number),
             begin_ns=Unit().begin_ns + number * 1000 * NS_PER_MS,
         )
-        write_session(folder / "raw" / name, unit)
+        capture = write_session(folder / "raw" / name, unit)
+        if name.startswith("cut"):
+            # Within the last record: all packets before it are there, and none counts as lost.
+            capture.write_bytes(capture.read_bytes()[:-100])
     (folder / "saboteur" / "sitecustomize.py").write_text(SABOTEUR, encoding="utf-8")
-    (folder / "manifest.yaml").write_text(
-        "schema: mlbatch.batch/1\n"
-        "options: {rate: 20}\n"
-        'sessions:\n  - {glob: "raw/*/", name: "{folder}"}\n',
-        encoding="utf-8",
-    )
+    (folder / "manifest.yaml").write_text("\n".join(lines), encoding="utf-8")
     return Dataset(folder)
 
 

@@ -1,170 +1,92 @@
-"""Batches and conversions from and to an S3-compatible server, with a network that is cut."""
+"""Conversions from and to object storage; what a batch there does besides is in test_outcomes."""
 
 from __future__ import annotations
 
-import importlib
-import json
+import contextlib
 import os
-import subprocess
-import sys
+import shutil
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import pytest
 
 from mlbatch.batch import remote
-from mlbatch.errors import RecordingError
-from tests.batch.network import Network, s3_server
-from tests.batch.sessions import Dataset, Ended, run, scans, write_dataset
-from tests.builders.run import ROOT
-
-NEEDED = "needs the extra dev-integrations (an S3 server)"
-pytest.importorskip("obstore")
-pytest.importorskip("moto", reason=NEEDED)
-pytest.importorskip("flask_cors", reason=NEEDED)
-boto3: Any = importlib.import_module("boto3")
-
-NAMES = ["a1", "a2", "b1", "hopeless"]
-
-
-@dataclass(frozen=True, slots=True)
-class Cloud:
-    """The server with a dataset under s3://data/raw."""
-
-    network: Network
-    env: dict[str, str]
-    client: Any
-    data: Dataset
-
-    def run(self, *words: str | Path) -> Ended:
-        """`mlbatch WORDS` in a process of its own."""
-        done = subprocess.run(
-            [sys.executable, "-m", "mlbatch", *map(str, words)],
-            capture_output=True,
-            text=True,
-            env=os.environ | self.env | {"PYTHONPATH": str(ROOT)},
-            check=False,
-        )
-        return Ended(done.returncode, done.stdout, done.stderr)
-
-    def files(self, prefix: str) -> dict[str, bytes]:
-        """Content of the objects below a prefix."""
-        listed = self.client.list_objects_v2(Bucket="data", Prefix=prefix).get("Contents", [])
-        return {
-            one["Key"].removeprefix(prefix): self.client.get_object(Bucket="data", Key=one["Key"])[
-                "Body"
-            ].read()
-            for one in listed
-        }
+from mlbatch.errors import Interrupted, RecordingError
+from tests.batch.network import Cloud, cloud_of
+from tests.batch.sessions import write_dataset
 
 
 @pytest.fixture(scope="module")
 def cloud(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Cloud]:
-    data = write_dataset(tmp_path_factory.mktemp("cloud") / "data", NAMES)
-    with s3_server() as (network, env):
-        client = boto3.client(
-            "s3",
-            endpoint_url=env["AWS_ENDPOINT_URL"],
-            aws_access_key_id="test",
-            aws_secret_access_key="test",
-            region_name="us-east-1",
-        )
-        client.create_bucket(Bucket="data")
-        for path in (data.folder / "raw").rglob("*"):
-            if path.is_file():
-                key = path.relative_to(data.folder).as_posix()
-                # Also for clients without credentials.
-                client.upload_file(str(path), "data", key, ExtraArgs={"ACL": "public-read"})
-        yield Cloud(network, env, client, data)
+    with cloud_of(write_dataset(tmp_path_factory.mktemp("cloud") / "data", ["a1"])) as found:
+        yield found
 
 
-@pytest.fixture(scope="module")
-def local(cloud: Cloud, tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
-    """The outputs of the same sessions on a local disk."""
-    out = tmp_path_factory.mktemp("local") / "out"
-    assert run(cloud.data, out, "--workers", "2").code == 3
-    return scans(out)
+def near(cloud: Cloud, output: Path, *words: str | Path) -> Path:
+    """The local recording, converted."""
+    capture = cloud.data.folder / "raw" / "a1" / "drive.pcap"
+    ended = cloud.run("convert", capture, "-o", output, "--rate", "20", "--quiet", *words)
+    assert ended.code == 0, ended.err
+    return output
 
 
-def outputs(files: dict[str, bytes]) -> dict[str, bytes]:
-    """The scans among the files of a batch."""
-    return {name: data for name, data in files.items() if "/scans" in name}
-
-
-@pytest.mark.parametrize("cut_after", [None, 300_000, 700_000])
-def test_from_and_to_the_server(
-    cut_after: int | None, cloud: Cloud, local: dict[str, bytes], tmp_path: Path
-) -> None:
-    """The network is cut while recordings are read, or while outputs are written."""
-    prefix = f"out-{cut_after}/"
-    places = ("s3://data/raw/*/", "-o", f"s3://data/{prefix}", "--cache", tmp_path / "cache")
-    words = (*places, "--rate", "20", "--workers", "2")
-    cuts = cloud.network.cuts
-    cloud.network.cut_after = cut_after
-    ended = cloud.run("batch", *words)
-    assert cloud.network.cuts - cuts == (cut_after is not None)
-    assert ended.code == 3, ended.err
-    states = {"a1": "done", "a2": "done", "b1": "done"}
-    # A folder without recordings is no session, one with another file of such a name fails.
-    assert ended.table == states | {"hopeless": "failed"}
-    found = cloud.files(prefix)
-    assert outputs(found) == local
-    for name in states:
-        assert json.loads(found[f"{name}/session.json"])["state"] == "done"
-    assert not [name for name in found if "started" in name or "partial" in name]
-    # Outputs are removed from the cache once they are uploaded.
-    assert not list((tmp_path / "cache" / "outputs").rglob("scans*"))
-
-    again = cloud.run("batch", *words)
-    assert again.code == 3
-    assert again.table == dict.fromkeys(states, "skipped") | {"hopeless": "failed"}
-    status = json.loads(cloud.run("batch-status", f"s3://data/{prefix}", "--json").out)
-    assert status["states"] == {"done": 3, "failed": 1, "unfinished": 0}
-
-
-def test_another_server_of_files_is_a_changed_input(cloud: Cloud, tmp_path: Path) -> None:
-    data = (cloud.data.folder / "raw" / "a1" / "drive.pcap").read_bytes()
-    cloud.client.put_object(Bucket="data", Key="new/a1/drive.pcap", Body=data)
-    meta = (cloud.data.folder / "raw" / "a1" / "111.json").read_bytes()
-    cloud.client.put_object(Bucket="data", Key="new/a1/111.json", Body=meta)
-    places = ("-o", tmp_path / "out", "--cache", tmp_path / "cache")
-    words = ("batch", "s3://data/new/a1/*.pcap", *places)
-    assert cloud.run(*words).table == {"drive": "done"}
-    assert cloud.run(*words).table == {"drive": "skipped"}
-    cloud.client.put_object(Bucket="data", Key="new/a1/drive.pcap", Body=data[:-3000])
-    assert cloud.run(*words).table == {"drive": "done"}
-
-
-def test_the_cache_has_a_limit(cloud: Cloud, tmp_path: Path) -> None:
-    cache = tmp_path / "cache"
-    sizes = [(cloud.data.folder / "raw" / name / "drive.pcap").stat().st_size for name in ("a1",)]
-    limit = 1.5 * sizes[0]
-    words = ("s3://data/raw/[ab]?/", "-o", tmp_path / "out", "--cache", cache)
-    ended = cloud.run("batch", *words, "--cache-gb", f"{limit / 1e9:.9f}")
-    assert ended.code == 0, ended.out
-    kept = sum(path.stat().st_size for path in (cache / "inputs").rglob("*.pcap"))
-    assert 0 < kept <= limit
-    small = cloud.run("batch", *words, "--cache-gb", "0.000001", "--rate", "5")
-    assert small.code == 3
-    assert "--cache-gb" in small.out
-
-
-def test_convert_alone(cloud: Cloud, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.fixture(autouse=True)
+def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The folder for copies."""
     monkeypatch.setenv("MLBATCH_CACHE", str(tmp_path / "cache"))
+    return tmp_path / "cache"
+
+
+def test_another_version_is_a_changed_input(cloud: Cloud, tmp_path: Path) -> None:
+    folder = Path(shutil.copytree(cloud.data.folder / "raw" / "a1", tmp_path / "new"))
+    words = ("batch", "s3://data/new/a1/*.pcap", "-o", tmp_path / "out")
+    for path in folder.iterdir():
+        cloud.put(f"new/a1/{path.name}", path)
+    assert cloud.run(*words).table == {"drive": "done"}
+    assert cloud.run(*words, "--plan").table == {"drive": "done"}
+    assert cloud.run(*words).table == {"drive": "skipped"}
+    capture = folder / "drive.pcap"
+    capture.write_bytes(capture.read_bytes()[:-3000])
+    cloud.put("new/a1/drive.pcap", capture)
+    assert cloud.run(*words, "--plan").table == {"drive": "changed"}
+    assert cloud.run(*words).table == {"drive": "done"}
+
+
+@pytest.mark.parametrize("error", [None, Interrupted(), KeyboardInterrupt(), RecordingError()])
+def test_copies_stay_for_an_interrupted_run(
+    error: BaseException | None, cloud: Cloud, cache: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """With the time of change in the store, by which `convert --resume` knows a recording."""
+    for name, value in cloud.env.items():
+        monkeypatch.setenv(name, value)
+    url = "s3://data/raw/a1/drive.pcap"
+    raised = contextlib.suppress(Interrupted, KeyboardInterrupt, RecordingError)
+    with raised, remote.fetched([url], cache, "user") as copies:
+        path = Path(copies[url])
+        first = path.stat()
+        changed = cloud.client.head_object(Bucket="data", Key="raw/a1/drive.pcap")["LastModified"]
+        assert first.st_mtime == changed.timestamp()
+        assert {one.name for one in path.parent.iterdir()} == {"drive.pcap", "111.json"}
+        if error is not None:
+            raise error
+    is_interrupted = isinstance(error, (Interrupted, KeyboardInterrupt))
+    assert path.exists() == is_interrupted
+    with remote.fetched([url], cache, "user"):
+        assert (path.stat().st_ctime_ns == first.st_ctime_ns) == is_interrupted
+    assert not path.exists()
+
+
+def test_convert_alone(cloud: Cloud, tmp_path: Path, cache: Path) -> None:
     words = ("s3://data/raw/a1/drive.pcap", "-o", "s3://data/alone/scans.mcap", "--rate", "20")
     ended = cloud.run("convert", *words, "--quiet")
     assert ended.code == 0, ended.err
     lines = ended.err.splitlines()
     assert lines[0].startswith("mlbatch: s3://data/raw/a1/drive.pcap: copied to ")
     assert lines[-1].startswith("mlbatch: uploaded s3://data/alone/scans.mcap (")
-    near = tmp_path / "near.mcap"
-    capture = cloud.data.folder / "raw" / "a1" / "drive.pcap"
-    assert cloud.run("convert", capture, "-o", near, "--rate", "20", "--quiet").code == 0
     found = cloud.files("alone/")
-    assert found["scans.mcap"] == near.read_bytes()
+    assert found["scans.mcap"] == near(cloud, tmp_path / "near.mcap").read_bytes()
     assert set(found) == {"scans.mcap", "scans.mcap.report.json", "scans.mcap.scans.csv"}
+    assert not [path for path in cache.rglob("*") if path.is_file()]
     again = cloud.run("convert", *words, "--quiet")
     assert (again.code, len(again.err.splitlines())) == (1, 1)
     assert "--overwrite" in again.err
@@ -172,30 +94,25 @@ def test_convert_alone(cloud: Cloud, tmp_path: Path, monkeypatch: pytest.MonkeyP
 
 @pytest.mark.parametrize("kind", ["scans.mcap", "scans"])
 def test_digests_of_outputs_on_the_server(kind: str, cloud: Cloud, tmp_path: Path) -> None:
-    capture = cloud.data.folder / "raw" / "a1" / "drive.pcap"
-    near = tmp_path / kind
-    words = (capture, "-o", near, "--rate", "20", "--split", "--quiet")
-    assert cloud.run("convert", *words).code == 0
+    local = near(cloud, tmp_path / kind, "--split")
     # A folder with folders of sensors, or a file with report and table next to it.
     for path in sorted(tmp_path.rglob("*")):
         if path.is_file():
-            key = f"digest/{path.relative_to(tmp_path).as_posix()}"
-            cloud.client.upload_file(str(path), "data", key)
+            cloud.put(f"digest/{path.relative_to(tmp_path).as_posix()}", path)
     url = f"s3://data/digest/{kind}"
-    golden = cloud.run("digest", near)
+    golden = cloud.run("digest", local)
     assert golden.code == 0, golden.err
     assert cloud.run("digest", url) == golden
     (tmp_path / "golden.json").write_text(golden.out, encoding="utf-8")
     against = cloud.run("digest", url, "--against", tmp_path / "golden.json")
     assert (against.code, against.err) == (0, "")
-    assert cloud.run("diff", near, url).code == 0
+    assert cloud.run("diff", local, url).code == 0
 
 
 def test_shards_of_a_copied_recording(
     cloud: Cloud, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     words = ("s3://data/raw/a1/drive.pcap", "--rate", "20", "--format", "npz", "-o")
-    monkeypatch.setenv("MLBATCH_CACHE", str(tmp_path / "cache"))
     assert cloud.run("convert", *words, tmp_path / "whole").code == 0
     parts = [tmp_path / "part1", tmp_path / "part2"]
     for number, part in enumerate(parts, 1):
@@ -213,17 +130,15 @@ def test_shards_of_a_copied_recording(
     assert found == whole
 
 
-def test_a_web_server(cloud: Cloud, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_web_server(cloud: Cloud, tmp_path: Path) -> None:
     """Without lists of files, calibrations are named."""
-    monkeypatch.setenv("MLBATCH_CACHE", str(tmp_path / "cache"))
     server = f"{cloud.env['AWS_ENDPOINT_URL']}/data/raw/a1"
-    folder = cloud.data.folder / "raw" / "a1"
-    words = ("--rate", "20", "--metadata", folder / "111.json", "--quiet")
+    calibration = cloud.data.folder / "raw" / "a1" / "111.json"
+    words = ("--rate", "20", "--metadata", calibration, "--quiet")
     ended = cloud.run("convert", f"{server}/drive.pcap", "-o", tmp_path / "web.mcap", *words)
     assert ended.code == 0, ended.err
-    near = tmp_path / "near.mcap"
-    assert cloud.run("convert", folder / "drive.pcap", "-o", near, *words).code == 0
-    assert (tmp_path / "web.mcap").read_bytes() == near.read_bytes()
+    local = near(cloud, tmp_path / "near.mcap", "--metadata", calibration)
+    assert (tmp_path / "web.mcap").read_bytes() == local.read_bytes()
 
 
 @pytest.mark.parametrize(

@@ -257,11 +257,6 @@ WORDS = {
         "/dev/null: expected a new file or an earlier page, found a device; choose another name "
         "for the page",
     ),
-    "cache of no size": (
-        f"batch {CAPTURE} -o sessions --cache-gb nan",
-        2,
-        "--cache-gb: expected more than 0 GB, found nan; write 100",
-    ),
 }
 
 
