@@ -81,7 +81,7 @@ def batch(
         Path | None,
         typer.Option(help="Folder for copies of files of object storage.", metavar="DIR"),
     ] = None,
-    cache_gb: Annotated[float | None, typer.Option(hidden=True)] = None,
+    cache_gb: Annotated[float | None, typer.Option(help="Ignored.", hidden=True)] = None,
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No table, no progress.")] = False,
     **values: Any,
 ) -> None:
