@@ -382,6 +382,27 @@ def test_sensors_of_one_model_are_decoded_together(chosen: list[int], others: li
     for seed, layout in enumerate(("dense", "organized", "dense")):
         case = Case(seed, 700, layout, EXTRAS, is_cut=seed == 0, keeps_repeated=False)
         check([others[number] for number in chosen], case)
+        alone(Drawn([others[number] for number in chosen], case))
+
+
+def alone(drawn: Drawn) -> None:
+    """Each sensor has the points, bit by bit, that it has alone."""
+    columns = drawn.columns()
+    together = Decoder(drawn.info, drawn.sources, drawn.boxes_m).scan(columns, HEADER)
+    for number, source in enumerate(drawn.sources):
+        own = columns.take(np.flatnonzero(columns.sensor == number))
+        one = replace(own, sensor=np.zeros(len(own), np.int64))
+        decoder = Decoder(drawn.info, [source], drawn.boxes_m, only=number)
+        scan = decoder.scan(one, HEADER)
+        is_organized = scan.info.layout == "organized"
+        is_own = columns.sensor == number if is_organized else together.lidar_id == number
+        assert scan.points > 0
+        for name in ("xyz", "intensity", "time_ns", "ring", "return_type"):
+            expected = getattr(scan, name)
+            found = getattr(together, name)[is_own]
+            # Of sensors with fewer slots the others are empty.
+            found = found[:, : expected.shape[1]] if is_organized else found
+            assert found.tobytes() == expected.tobytes(), name
 
 
 @pytest.mark.parametrize("layout", ["dense", "organized"])

@@ -44,7 +44,7 @@ from tests.builders.captures import udp_frame
 from tests.builders.engines import BOXES_M, Pair
 from tests.builders.headers import check_headers, ouster_packets
 from tests.builders.rotor import rotor_words
-from tests.builders.velodyne_streams import PLAIN, made_of
+from tests.builders.spinning import PLAIN, stream_of
 from tests.decode.test_engine import (
     END_NS,
     NAMES,
@@ -151,10 +151,10 @@ def _decode(data: bytes, folder: Path) -> None:
 def _headed() -> Sequence[tuple[Lidar, U8Array]]:
     """Lidars whose headers the loops read, and packets of them."""
     specs = [OusterSpec(name, 16, 512) for name in NAMES]
-    made = [made_of(VelodyneSpec(model, mode)) for model in PLAIN for mode in ("last", "dual")]
+    streams = [stream_of(VelodyneSpec(model, mode)) for model in PLAIN for mode in ("last", "dual")]
     return (
         *(ouster_packets(spec) for spec in specs),
-        *((one.lidar, one.sent.payloads[:3]) for one in made),
+        *((one.lidar(), one.packets[:3]) for one in streams),
     )
 
 

@@ -19,7 +19,7 @@ from mlbatch.simulate.ouster.encode import OusterSpec
 from mlbatch.simulate.velodyne.encode import VelodyneSpec
 from tests.builders.engines import needs_native
 from tests.builders.headers import check_headers, ouster_packets
-from tests.builders.velodyne_streams import MODES, PLAIN, made_of
+from tests.builders.spinning import stream_of
 from tests.contract.test_models import cases
 
 pytestmark = needs_native
@@ -30,12 +30,6 @@ OUSTER = tuple(
     for name in PROFILES
     if name != "OFF"
     for header in (STANDARD, FUSA)
-)
-# Blind sectors are gaps; at 3599.997 s the hour ends.
-VELODYNE = tuple(
-    VelodyneSpec(model, mode, start_azimuth_deg=357.2, start_us=3_599_997_000.0)
-    for model in (*PLAIN, "HDL-64E S3")
-    for mode in MODES
 )
 
 
@@ -79,18 +73,6 @@ def test_of_ouster_packets_all_are_read(spec: OusterSpec) -> None:
         check_headers(lidar, damaged(lidar, packets, seed), host_ns)
 
 
-@pytest.mark.parametrize("spec", VELODYNE, ids=lambda spec: f"{spec.model} {spec.mode}")
-def test_of_velodyne_packets_all_are_read(spec: VelodyneSpec) -> None:
-    made = made_of(spec)
-    packets, host_ns = made.sent.payloads, made.sent.host_ns
-    found = check_headers(made.lidar, packets, host_ns)
-    assert found.is_mine.all()
-    assert not found.faults.any()
-    assert found.columns.valid.all()
-    for seed in range(24):
-        check_headers(made.lidar, damaged(made.lidar, packets, seed), host_ns)
-
-
 @pytest.mark.parametrize("change", ["swapped", "unmeasured", "serial", "type", "position"])
 def test_unusual_ouster_packets(change: str) -> None:
     lidar, packets = ouster_packets(OusterSpec("RNG15_RFL8_NIR8", 16, 512, serial=SERIAL))
@@ -113,8 +95,8 @@ def test_unusual_ouster_packets(change: str) -> None:
 
 @pytest.mark.parametrize("change", ["swapped", "flag", "azimuth", "hour", "mode", "gap"])
 def test_unusual_velodyne_packets(change: str) -> None:
-    made = made_of(VelodyneSpec("VLP-16", "strongest"))
-    packets = made.sent.payloads.copy()
+    stream = stream_of(VelodyneSpec("VLP-16", "strongest"))
+    packets = stream.packets
     if change == "swapped":
         packets = packets[[0, 2, 1]]
     elif change == "flag":
@@ -128,7 +110,7 @@ def test_unusual_velodyne_packets(change: str) -> None:
     else:
         first = int(packets[1, 2:4].view("<u2")[0])
         packets[1, 102:104] = np.array([(first + 3000) % 36000], "<u2").view(np.uint8)
-    found = check_headers(made.lidar, packets, made.sent.host_ns[: len(packets)])
+    found = check_headers(stream.lidar(), packets, stream.host_ns[: len(packets)])
     assert found.faults[:3].tolist() == [0, 2 * (change not in ("swapped", "gap")), 0]
 
 

@@ -14,8 +14,8 @@ from tests.builders.decoded import projected
 from tests.builders.rotor import rotor_words
 from tests.recordings import RECORDINGS
 from tests.sensors.hesai.test_at128 import CHANNELS, DEG, NO_FIRING, beams, by_the_sheet
-from tests.sensors.velodyne.test_calibration import read
-from tests.sensors.velodyne.test_hdl64 import check_many_points
+from tests.sensors.test_files import read
+from tests.sensors.velodyne.test_geometry import check_many_points
 
 VELODYNE_FOLDER = RECORDINGS / "velodyne"
 # Real files: the first lines, read by eye; angles of docs/sources/velodyne.md section 6.
@@ -31,7 +31,7 @@ VELODYNE = {
 
 def real(name: str) -> VelodyneFile:
     path = VELODYNE_FOLDER / name
-    return read(path.read_bytes(), path)
+    return read(path.read_bytes(), str(path))
 
 
 @pytest.mark.parametrize("name", VELODYNE)

@@ -7,12 +7,11 @@ import pytest
 
 from mlbatch.sensors import content_keys
 from mlbatch.sensors.packet_bytes import number
-from mlbatch.simulate.velodyne.encode import VelodyneSpec
-from tests.builders.velodyne_streams import made_of
+from tests.builders.spinning import velodyne_calibration
 
 
 def test_a_lidar_without_imu() -> None:
-    lidar = made_of(VelodyneSpec("VLP-16")).lidar
+    lidar = velodyne_calibration("VLP-16").lidar({}, None)
     assert not lidar.is_imu(48)
     assert len(lidar.imu(np.zeros((2, 48), np.uint8), 3).stamp_ns) == 0
     assert lidar.sensor_from_imu() is None

@@ -1,4 +1,4 @@
-"""CRC-64/XZ against its published check value and the definition, bit by bit."""
+"""Checksums against their published check values, CRC-64/XZ also bit by bit."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mlbatch.sensors.crc import crc64
+from mlbatch.sensors.crc import crc32, crc64
 
 
 def bitwise(message: bytes) -> int:
@@ -19,10 +19,11 @@ def bitwise(message: bytes) -> int:
     return register ^ (2**64 - 1)
 
 
-def test_the_check_value_of_the_catalogue() -> None:
-    # "123456789" gives 995DC9BBDF1939FA in the catalogue of parametrised checksums.
-    message = np.frombuffer(b"123456789", np.uint8)[None, :]
-    assert crc64(message).tolist() == [0x995DC9BBDF1939FA]
+def test_check_values_of_the_catalogue() -> None:
+    """Of "123456789", in the catalogue of parametrised checksums; CRC-32 is CRC-32/MPEG-2."""
+    messages = np.stack([np.frombuffer(b"123456789", np.uint8)] * 300)
+    assert crc64(messages).tolist() == [0x995DC9BBDF1939FA] * 300
+    assert crc32(messages).tolist() == [0x0376E6E7] * 300
 
 
 @settings(max_examples=60)

@@ -9,14 +9,18 @@ from __future__ import annotations
 
 import math
 import struct
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
 import pytest
 
-from mlbatch.arrays import U8Array
+from mlbatch.arrays import F32Array, I64Array
+from mlbatch.lidar.interface import Lidar
 from mlbatch.simulate.hesai.angles import MirrorAngles, angles_csv, fan
-from tests.builders.hesai_decoded import decode, rows
+from tests.builders.decoded import readings
+from tests.builders.others import rows
+from tests.builders.spinning import evidence_of, fired, from_file
 
 # 2023-06-15 12:30:45.678901 UTC; `date -u -d 2023-06-15T12:30:45 +%s` says 1686832245.
 DATE = bytes([123, 6, 15, 12, 30, 45])
@@ -55,6 +59,28 @@ class Case:
     mode: int = 0x37
     unit_mm: int = 4
     more: tuple[tuple[int, str], ...] = ()
+
+
+@dataclass(frozen=True)
+class Decoded:
+    """All columns of two equal packets."""
+
+    lidar: Lidar
+    range_m: F32Array
+    intensity: F32Array
+    xyz: F32Array
+    stamp_ns: I64Array
+    time_ns: I64Array
+
+
+def decode(packet: bytes, content: bytes, options: Mapping[str, str] | None = None) -> Decoded:
+    """Two packets like this, with an angle file."""
+    packets = rows([packet] * 2)
+    lidar = from_file(content).lidar(options or {}, evidence_of(packets))
+    assert not lidar.faults(packets).any()
+    found = readings(lidar, packets)
+    time_ns, _, _ = fired(lidar, found.headers)
+    return Decoded(lidar, found.range_m, found.intensity, found.xyz, found.stamp_ns, time_ns)
 
 
 def _starts(first: int, stride: int, count: int) -> tuple[int, ...]:
@@ -303,11 +329,11 @@ def _csv(case: Case) -> bytes:
 @pytest.mark.parametrize("case", CASES, ids=lambda case: f"{case.model}-{case.size}-{case.mode:x}")
 def test_hand_worked_points(case: Case, turning: bool) -> None:
     options = {} if turning else {"firing_azimuth": "off"}
-    found = decode(rows([_packet(case)] * 2), _csv(case), options)
+    found = decode(_packet(case), _csv(case), options)
     assert found.lidar.model == case.model
     # Nothing else came back, in either of the two packets.
     assert np.count_nonzero(found.range_m) == 2 * len(case.shots)
-    points = found.xyz()
+    points = found.xyz
     for number, shot in enumerate(case.shots):
         place = shot.column, shot.channel, shot.which
         range_m = (2501 + number) * case.unit_mm / 1000
@@ -336,9 +362,8 @@ def test_azimuths_of_an_xt_as_in_the_vendors_sdk(
     stride = 2 + 4 * case.channels
     for channel in range(case.channels):
         struct.pack_into("<H", packet, 14 + 4 * channel, 10_000)
-    packets = rows([bytes(packet)] * 2)
-    found = decode(packets, angles_csv(fan(model, case.channels)[0], [0.0] * case.channels))
-    xyz = found.xyz()[0, :, 0]
+    found = decode(bytes(packet), angles_csv(fan(model, case.channels)[0], [0.0] * case.channels))
+    xyz = found.xyz[0, :, 0]
     azimuth_deg = np.degrees(np.arctan2(xyz[:, 0], xyz[:, 1]))
     number = np.arange(case.channels) % together
     expected_deg = 40 + rpm * 6e-6 * (6 + step_us * number)
@@ -351,7 +376,7 @@ def test_azimuths_of_an_xt_as_in_the_vendors_sdk(
 
 
 def test_a_column_is_stamped_at_its_earliest_firing() -> None:
-    found = decode(rows([_packet(CASES[0])] * 2), _csv(CASES[0]))
+    found = decode(_packet(CASES[0]), _csv(CASES[0]))
     # Channel 8 of a Pandar40P is the first to fire, 54670 ns before the block's end.
     assert found.stamp_ns[9] == PACKET_NS - 28580 - 54670
     assert found.lidar.firing_ns.shape == (1, 40)
@@ -359,7 +384,7 @@ def test_a_column_is_stamped_at_its_earliest_firing() -> None:
 
 
 def test_channels_that_a_loop_leaves_out() -> None:
-    lidar = decode(rows([_packet(CASES[5])] * 2), _csv(CASES[5])).lidar
+    lidar = decode(_packet(CASES[5]), _csv(CASES[5])).lidar
     assert (lidar.firing_ns[0] == -1).nonzero()[0].tolist() == list(range(32))
     assert (lidar.firing_ns[1] == -1).nonzero()[0].tolist() == list(range(32, 64))
 
@@ -369,7 +394,7 @@ def test_small_numbers_of_an_ot128_are_words(raw: int, range_m: float) -> None:
     case = next(case for case in CASES if case.model == "OT128")
     packet = bytearray(_packet(case))
     struct.pack_into("<H", packet, case.shots[1].at, raw)
-    found = decode(rows([bytes(packet)] * 2), _csv(case))
+    found = decode(bytes(packet), _csv(case))
     assert found.range_m[1, 2, 0] == np.float32(range_m)
 
 
@@ -382,12 +407,12 @@ def test_ranges_are_correctly_rounded(unit_mm: int) -> None:
     for block, values in enumerate(raw.tolist()):
         for channel, value in enumerate(values):
             struct.pack_into("<H", packet, 14 + 130 * block + 4 * channel, value)
-    found = decode(rows([bytes(packet)] * 2), _csv(case))
+    found = decode(bytes(packet), _csv(case))
     # A quotient of float64 is so close that rounding it again hits the nearest float32.
     assert (found.range_m[:8, :, 0] == (raw * unit_mm / 1000).astype(np.float32)).all()
 
 
-def _at128(mode: int, shots: list[tuple[int, int, int]]) -> U8Array:
+def _at128(mode: int, shots: list[tuple[int, int, int]]) -> bytes:
     """Packets of an AT128: 12 + 2 x 515 + 4 + 32 bytes, sequence, CRC, signature; 200 rpm."""
     packet = bytearray(1118)
     packet[:12] = bytes.fromhex("eeff04010000800200040109")
@@ -400,13 +425,13 @@ def _at128(mode: int, shots: list[tuple[int, int, int]]) -> U8Array:
         struct.pack_into("<HB", packet, 12 + 515 * block, 3000, 128)
     for at, raw, level in shots:
         struct.pack_into("<HB", packet, at, raw, level)
-    return rows([bytes(packet)] * 2)
+    return bytes(packet)
 
 
 def test_hand_worked_points_of_an_at128() -> None:
     dat = MirrorAngles((20.0, 140.0, 260.0), [_ELEVATION_DEG] * 128, [1.0] * 128).dat()
-    packets = _at128(0x37, [(12 + 3 + 8, 2501, 1), (12 + 515 + 3, 2502, 2), (530 + 508, 2503, 3)])
-    found = decode(packets, dat)
+    packet = _at128(0x37, [(12 + 3 + 8, 2501, 1), (12 + 515 + 3, 2502, 2), (530 + 508, 2503, 3)])
+    found = decode(packet, dat)
     assert (found.lidar.model, found.lidar.channels) == ("AT128", 128)
     expected = [
         # column, channel, block, firing: -9249 - 41666 x (2 - b), then the table.
@@ -414,7 +439,7 @@ def test_hand_worked_points_of_an_at128() -> None:
         (1, 0, -50915, 0),
         (1, 127, -50915, 8264),
     ]
-    points = found.xyz()
+    points = found.xyz
     for number, (column, channel, block_ns, firing_ns) in enumerate(expected):
         range_m = (2501 + number) * 0.004
         assert found.range_m[column, channel, 0] == np.float32(range_m)
