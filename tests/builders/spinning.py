@@ -21,7 +21,7 @@ from mlbatch.simulate.velodyne.encode import VelodyneSpec
 from mlbatch.simulate.velodyne.models import calibration_yaml
 from mlbatch.types import ColumnHeaders, Stream
 from tests.builders.decoded import Readings, readings
-from tests.builders.encoded import Spec, encoded, hesai_unit, shape
+from tests.builders.lidar_packets import Spec, encoded, hesai_unit, shape
 from tests.builders.others import rows
 
 STREAM = Stream("192.168.1.201", 2368)

@@ -26,7 +26,7 @@ from mlbatch.simulate.velodyne.encode import VelodyneSpec
 from mlbatch.simulate.velodyne.models import MODELS as VELODYNE
 from mlbatch.simulate.velodyne.models import calibration_yaml
 from mlbatch.types import Stream
-from tests.builders.encoded import Spec, hesai_unit
+from tests.builders.lidar_packets import Spec, hesai_unit
 from tests.builders.others import filled
 from tests.builders.spinning import (
     STREAM,

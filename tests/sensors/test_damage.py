@@ -11,7 +11,7 @@ from mlbatch.lidar.interface import FAULTS
 from mlbatch.simulate.hesai.encode import DUAL, HesaiSpec
 from mlbatch.simulate.robosense.encode import RobosenseSpec
 from mlbatch.simulate.velodyne.encode import VelodyneSpec
-from tests.builders.encoded import Spec
+from tests.builders.lidar_packets import Spec
 from tests.builders.spinning import stream_of
 
 XT32 = HesaiSpec("PandarXT-32", DUAL)

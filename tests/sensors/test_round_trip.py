@@ -25,7 +25,7 @@ from mlbatch.simulate.robosense.models import AIRY_MOUNTS, LAST, NEAREST
 from mlbatch.simulate.robosense.models import MODELS as ROBOSENSE
 from mlbatch.simulate.velodyne.encode import VelodyneSpec
 from mlbatch.simulate.velodyne.models import MODELS as VELODYNE
-from tests.builders.encoded import Spec
+from tests.builders.lidar_packets import Spec
 from tests.builders.spinning import MODES, PLAIN, Encoded, fired, pointing, stream_of
 
 # Stamps of a Velodyne are whole us, its azimuths whole hundredths of a degree.

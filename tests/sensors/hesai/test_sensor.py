@@ -12,7 +12,7 @@ from mlbatch.simulate.hesai import encode as hesai
 from mlbatch.simulate.hesai.angles import angles_csv
 from mlbatch.simulate.hesai.encode import HesaiSpec
 from tests.builders.decoded import Rotor, projected, readings
-from tests.builders.encoded import hesai_unit
+from tests.builders.lidar_packets import hesai_unit
 from tests.builders.others import filled, rows
 from tests.builders.spinning import evidence_of, from_file, stream_of
 
