@@ -1,7 +1,8 @@
 """Every fault in rigs of one to four vendors, in every container: the declared result, and checks.
 
-The rows of the table are in `cells.py`, the law of windows in `law.py`. Every vendor is once the
-victim of every fault, since the rigs of one to four lidars begin with another vendor each.
+The rows of the table are in `cells.py`, the law of windows in `tests/reference/batching.py`. Every
+vendor is once the victim of every fault, since the rigs of one to four lidars begin with another
+vendor each.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ import json
 import tempfile
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from fractions import Fraction
 from hashlib import sha256
 from pathlib import Path
 from typing import Any
@@ -18,6 +20,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from mlbatch.arrays import I64Array
 from mlbatch.verification import verify
 from tests.builders.run import (
     Told,
@@ -28,10 +31,11 @@ from tests.builders.run import (
 )
 from tests.matrix.cells import KINDS, Kind, Session, plain
 from tests.matrix.containers import CONTAINERS, rig_text, span_ns
-from tests.matrix.law import PERIOD_NS, law
-from tests.matrix.lidars import VENDORS, Sent, write_metadata
+from tests.matrix.lidars import NS_PER_MS, NS_PER_S, VENDORS, Sent, write_metadata
+from tests.reference.batching import FeedPacket, Outcome, Settings, Window, reference_scans
 
 SIZES = (1, 2, 3, 4)
+PERIOD_NS = 50 * NS_PER_MS
 WARNING = "mlbatch: warning: "
 Report = dict[str, Any]
 Print = tuple[object, ...]
@@ -128,20 +132,40 @@ def check_proof(folder: Path) -> Report:
     return report
 
 
+def reference(session: Session, wait_ns: int = NS_PER_S) -> Outcome:
+    """The paper's loop over the packets in the order of arrival."""
+    feed = [
+        FeedPacket(number, host_ns, -1, tuple(stamps), (True,) * len(stamps))
+        for number, sent in enumerate(session)
+        for host_ns, stamps in zip(sent.host_ns.tolist(), sent.stamp_ns.tolist(), strict=True)
+    ]
+    feed.sort(key=lambda packet: packet.host_ns)
+    return reference_scans(feed, Settings(Fraction(20), len(session), max_wait_ns=wait_ns))
+
+
+def columns_of(session: Session, window: Window) -> tuple[I64Array, I64Array, int]:
+    """Stamp and sensor of the columns of a window, and the number of its points."""
+    places = window.columns
+    stamps = [session[sensor].stamp_ns[packet, column] for sensor, packet, column in places]
+    points = [session[sensor].points[packet, column] for sensor, packet, column in places]
+    return np.array(stamps), np.array([place[0] for place in places]), int(sum(points))
+
+
 def check_law(folder: Path, session: Session, wait_ns: int, report: Report) -> None:
     """Exactly these columns in these windows, and everything else counted by its reason."""
-    expected = law(session, wait_ns)
+    expected = reference(session, wait_ns)
     files = scan_files(folder)
-    assert [int(path.stem) for path in files] == list(expected.windows)
-    for path, window in zip(files, expected.windows.values(), strict=True):
+    assert [int(path.stem) for path in files] == [window.index for window in expected.windows]
+    for path, window in zip(files, expected.windows, strict=True):
         scan = load(path)
+        stamps, sensor, points = columns_of(session, window)
         assert int(scan["start_ns"]) == window.start_ns
         assert bool(scan["complete"]) == window.complete, path.name
-        assert np.array_equal(scan["column_stamp_ns"], window.stamp_ns)
-        assert np.array_equal(scan["column_lidar_id"], window.sensor)
-        assert len(scan["xyz"]) == window.points
+        assert np.array_equal(scan["column_stamp_ns"], stamps)
+        assert np.array_equal(scan["column_lidar_id"], sensor)
+        assert len(scan["xyz"]) == points
     assert int(report["grid"]["t_init_ns"]) == expected.t_init_ns
-    assert [one["columns"]["dropped"] for one in report["sensors"]] == list(expected.dropped)
+    assert [one["columns"]["dropped"] for one in report["sensors"]] == expected.dropped
     scans = report["scans"]
     assert (scans["written"], scans["incomplete"], scans["empty"]) == (
         len(expected.windows),
@@ -263,19 +287,20 @@ def has_loss(report: Report) -> bool:
 
 def check_subset(cell: Cell, report: Report) -> None:
     """Packets are missing or damaged, the others are where they belong."""
-    expected = law(cell.session)
+    expected = reference(cell.session)
     (fault,) = report["faults"]
     files = scan_files(cell.folder / "out")
-    assert [int(path.stem) for path in files] == list(expected.windows)
+    assert [int(path.stem) for path in files] == [window.index for window in expected.windows]
     astray = 0
-    for path, window in zip(files, expected.windows.values(), strict=True):
+    for path, window in zip(files, expected.windows, strict=True):
         scan = load(path)
+        stamps, sensor, _ = columns_of(cell.session, window)
         last = cell.size - 1
         assert bool(scan["complete"]) == window.complete
         hurt = scan["column_lidar_id"] == last
-        was_hurt = window.sensor == last
-        assert np.array_equal(scan["column_stamp_ns"][~hurt], window.stamp_ns[~was_hurt])
-        astray += len(np.setxor1d(scan["column_stamp_ns"][hurt], window.stamp_ns[was_hurt]))
+        was_hurt = sensor == last
+        assert np.array_equal(scan["column_stamp_ns"][~hurt], stamps[~was_hurt])
+        astray += len(np.setxor1d(scan["column_stamp_ns"][hurt], stamps[was_hurt]))
     columns = cell.session[-1].stamp_ns.shape[1]
     # Where a packet's stamps are damaged its columns are missing in one place, and in another.
     assert astray <= 2 * columns * fault["packets"]
