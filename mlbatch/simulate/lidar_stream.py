@@ -9,9 +9,13 @@ import numpy as np
 from mlbatch.arrays import F64Array, I64Array
 from mlbatch.simulate.interface import Sent, Shots
 from mlbatch.simulate.models import simulated_lidar
+from mlbatch.simulate.rays import Rays
 from mlbatch.simulate.scenario import Clock, ImuErrors, LidarPlan, Scenario
-from mlbatch.simulate.scene import Rays, Scene
+from mlbatch.simulate.scene import Scene
 from mlbatch.units import NS_PER_S
+
+# Full width at half maximum of a Gaussian: 2 sqrt(2 ln 2).
+_WIDTH_PER_SIGMA = 2.354820045
 
 
 @dataclass(frozen=True, slots=True, order=True)
@@ -101,14 +105,16 @@ class LidarStream:
         rays = Rays.of(
             origin.reshape(-1, 3)[chosen], direction.reshape(-1, 3)[chosen], time_s.ravel()[chosen]
         )
+        if self.plan.divergence_rad > 0.0:
+            _spread(rays, self.plan.divergence_rad, random)
         distance_m = np.full(shape[0] * shape[1], np.inf)
         level = np.zeros(shape[0] * shape[1])
         if len(chosen):
             distance_m[chosen], level[chosen] = self._scenario.scene.cast(
-                rays, self.plan.max_range_m
+                rays, self.plan.max_range_m, random
             )
             if self._scenario.body is not None:
-                self._hide(self._scenario.body, shots, chosen, distance_m, level)
+                self._hide(self._scenario.body, shots, rays.time_s, chosen, distance_m, level)
         if self.plan.noise_m > 0.0:
             noise = random.standard_normal(len(distance_m), dtype=np.float32)
             distance_m += self.plan.noise_m * noise
@@ -120,14 +126,23 @@ class LidarStream:
         return distance_m.reshape(shape), level.reshape(shape)
 
     def _hide(
-        self, body: Scene, shots: Shots, chosen: I64Array, distance_m: F64Array, level: F64Array
+        self,
+        body: Scene,
+        shots: Shots,
+        time_s: F64Array,
+        chosen: I64Array,
+        distance_m: F64Array,
+        level: F64Array,
     ) -> None:
-        """Replace what is behind the machine itself; its poses do not matter."""
+        """Replace what is behind the machine itself; its poses do not matter.
+
+        time_s: of the chosen shots.
+        """
         turn, arm = self.plan.body_from_sensor[:3, :3], self.plan.body_from_sensor[:3, 3]
         shape = shots.direction.shape
         origin = np.broadcast_to(np.matmul(shots.origin_m, turn.T) + arm, shape)
         direction = np.matmul(shots.direction, turn.T).reshape(-1, 3)[chosen]
-        rays = Rays.of(origin.reshape(-1, 3)[chosen], direction, np.zeros(len(chosen)))
+        rays = Rays.of(origin.reshape(-1, 3)[chosen], direction, time_s)
         own_m, own_level = body.cast(rays, self.plan.max_range_m)
         nearer = own_m < distance_m[chosen]
         distance_m[chosen[nearer]] = own_m[nearer]
@@ -198,6 +213,17 @@ class LidarStream:
             self._sent += 1
             found.append(Received(self._last_ns, self._index, self._sent, one.port, one.payload))
         return found
+
+
+def _spread(rays: Rays, divergence_rad: float, random: np.random.Generator) -> None:
+    """Move each ray to one place in its beam, whose profile is Gaussian.
+
+    A stem thinner than the beam is then met by its share of the shots, as is the edge of a wall.
+    """
+    sigma = divergence_rad / _WIDTH_PER_SIGMA
+    direction = rays.direction
+    direction += sigma * random.standard_normal(direction.shape, dtype=np.float32)
+    direction /= np.sqrt(np.einsum("in,in->n", direction, direction))
 
 
 def _cross_matrix(vectors: F64Array) -> F64Array:

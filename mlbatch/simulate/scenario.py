@@ -20,16 +20,20 @@ from mlbatch.errors import RigError
 from mlbatch.frames.transforms import from_rpy_deg
 from mlbatch.rig.rig import MAX_NAME
 from mlbatch.rig.yaml_tree import Node, read_yaml
-from mlbatch.simulate.forest import Forest, grown
+from mlbatch.simulate.foliage import Crowns
+from mlbatch.simulate.forest import CrownPlan, Forest, Row, grown
 from mlbatch.simulate.interface import LidarModel, LidarSettings
 from mlbatch.simulate.models import lidar_models
-from mlbatch.simulate.scene import Boxes, Rectangles, Scene, Stems
+from mlbatch.simulate.scene import Boxes, Rectangles, Scene, Stems, Swing
 from mlbatch.simulate.terrain import Terrain, rough_terrain
 from mlbatch.simulate.trajectory import (
     COORDINATES,
+    Curve,
+    MonotoneCurve,
     Spline,
     Sway,
     Trajectory,
+    ground_along,
     path_from_waypoints,
 )
 from mlbatch.units import NS_PER_S, RAD_PER_DEG
@@ -74,7 +78,8 @@ class ImuErrors:
 class LidarPlan:
     """A lidar of the rig; settings: without the start of its clock.
 
-    noise_m: standard deviation of ranges; dropout, loss: shares of returns and of packets that are
+    noise_m: standard deviation of ranges; divergence_rad: full width at half maximum of a beam's
+    Gaussian profile; dropout, loss: shares of returns and of packets that are
     missing; latency_s, jitter_s: from the last shot of a packet to its receive time.
     """
 
@@ -83,6 +88,7 @@ class LidarPlan:
     body_from_sensor: F64Array
     address: str
     noise_m: float
+    divergence_rad: float
     dropout: float
     loss: float
     max_range_m: float
@@ -250,6 +256,10 @@ def _extrinsics(fields: Mapping[str, Node]) -> F64Array:
 
 # -- motion ---------------------------------------------------------------------------------------
 
+_MOTION_KEYS = (
+    *("standstill_s", "above_ground", "footprint_m", "interpolation", "waypoints", "sway"),
+)
+_CURVES: dict[str, type[Curve]] = {"spline": Spline, "monotone": MonotoneCurve}
 _SWAY_KEYS = ("coordinate", "amplitude", "frequency_hz", "phase_deg")
 
 
@@ -262,7 +272,7 @@ def _trajectory(node: Node | None, terrain: Terrain | None) -> Trajectory:
     """Return the motion; none: the body stands at the origin."""
     if node is None:
         return Trajectory(Spline(np.zeros(1), np.zeros((1, 4))))
-    fields = node.fields(("standstill_s", "above_ground", "waypoints", "sway"))
+    fields = node.fields(_MOTION_KEYS)
     standstill_s = _optional(fields, "standstill_s", 0.0, 0.0, _MOST_SECONDS)
     rows = [[0.0] * 4]
     if "waypoints" in fields:
@@ -278,16 +288,27 @@ def _trajectory(node: Node | None, terrain: Terrain | None) -> Trajectory:
         raise fields["waypoints"].error(
             "times that start at 0 and increase", "others", "sort the waypoints"
         )
-    if "above_ground" in fields and fields["above_ground"].flag():
-        if terrain is None:
-            raise fields["above_ground"].error("a scene with terrain", "none", "remove the key")
+    is_above = "above_ground" in fields and fields["above_ground"].flag()
+    on_ground = is_above or "footprint_m" in fields
+    if on_ground and terrain is None:
+        key = "above_ground" if is_above else "footprint_m"
+        raise fields[key].error("a scene with terrain", "none", "remove the key")
+    if is_above and "footprint_m" in fields:
+        raise fields["footprint_m"].error(
+            "one of above_ground and footprint_m", "both", "remove above_ground"
+        )
+    if is_above and terrain is not None:
         table[:, 3] += terrain.height(table[:, 1:3])
     yaw = table[:, 4] * RAD_PER_DEG if table.shape[1] == 5 else None
     sway = (
         [_sway(item) for item in fields["sway"].elements("sinusoids")] if "sway" in fields else []
     )
-    path = path_from_waypoints(table[:, 0], table[:, 1:4], yaw)
-    return Trajectory(path, sway, standstill_s)
+    kind = fields["interpolation"].choice(tuple(_CURVES)) if "interpolation" in fields else "spline"
+    path = path_from_waypoints(table[:, 0], table[:, 1:4], yaw, _CURVES[kind])
+    ground = None
+    if terrain is not None and "footprint_m" in fields:
+        ground = ground_along(path, terrain, _number(fields["footprint_m"], 0.1, 100.0))
+    return Trajectory(path, sway, standstill_s, ground)
 
 
 def _waypoint(node: Node) -> list[float]:
@@ -315,12 +336,16 @@ def _sway(node: Node) -> Sway:
 _SCENE_KEYS = ("rectangles", "boxes", "stems", "terrain", "forest")
 _RECTANGLE_KEYS = ("corner_m", "along_m", "across_m", "reflectivity")
 _BOX_KEYS = ("centre_m", "size_m", "yaw_deg", "velocity_mps", "repeat_s", "reflectivity")
-_PART_KEYS = ("centre_m", "size_m", "yaw_deg", "reflectivity")
+_PART_KEYS = ("centre_m", "size_m", "yaw_deg", "reflectivity", "swing")
+_SWING_KEYS = ("pivot_m", "axis", "amplitude_deg", "frequency_hz", "phase_deg")
 _STEM_KEYS = ("base_m", "height_m", "radius_m", "top_radius_m", "reflectivity")
 _TERRAIN_KEYS = ("half_size_m", "cell_m", "relief_m", "wavelength_m", "reflectivity")
 _FOREST_KEYS = (
     *("area_m", "per_hectare", "radius_m", "height_m", "taper", "clearance_m", "reflectivity"),
+    "crown",
 )
+_CROWN_KEYS = ("low_m", "radius_m", "extinction_per_m", "wind", "flutter", "reflectivity")
+_WIND_KEYS = ("amplitude_m", "frequency_hz")
 _SMALL_M = 1e-3
 
 
@@ -362,14 +387,24 @@ def _scene(
         rows = [_box(item) for item in fields["boxes"].elements("boxes")]
         kinds += [Boxes(*_columns(rows))] if rows else []
     stems = [_stem(item) for item in fields["stems"].elements("stems")] if "stems" in fields else []
+    leaves: list[Row] = []
     if "forest" in fields:
         path = trajectory.poses(np.arange(0.0, duration_s, 0.5)).position_m
-        for number, item in enumerate(fields["forest"].elements("kinds of stems")):
-            stems += grown(_forest(item), (seed, number), path, terrain)
+        for number, item in enumerate(fields["forest"].elements("kinds of plants")):
+            own_stems, own_leaves = grown(_forest(item), (seed, number), path, terrain)
+            stems += own_stems
+            leaves += own_leaves
     kinds += [Stems(*_columns(stems))] if stems else []
-    if not kinds and terrain is None:
+    if not kinds and not leaves and terrain is None:
         raise node.error("at least one surface", "none", f"add {', '.join(_SCENE_KEYS)}")
-    return Scene(tuple(kinds), terrain, level)
+    return Scene(tuple(kinds), terrain, level, _foliage(leaves))
+
+
+def _foliage(rows: Sequence[Row]) -> Crowns | None:
+    if not rows:
+        return None
+    *columns, flutters = _columns(rows)
+    return Crowns(*columns, flutters=flutters > 0.0)
 
 
 def _body(node: Node, lidars: Sequence[LidarPlan]) -> Scene:
@@ -378,7 +413,8 @@ def _body(node: Node, lidars: Sequence[LidarPlan]) -> Scene:
     if not items:
         raise node.error("at least one box", node.shown, "remove the key")
     rows = [_box(item, _PART_KEYS) for item in items]
-    boxes = Boxes(*_columns(rows))
+    swing = Swing(*_columns([_swing(item) for item in items]))
+    boxes = Boxes(*_columns(rows), swing=swing if swing.amplitude_rad.any() else None)
     for number, item in enumerate(items):
         for plan in lidars:
             if boxes.contains(number, plan.body_from_sensor[:3, 3]):
@@ -386,7 +422,22 @@ def _body(node: Node, lidars: Sequence[LidarPlan]) -> Scene:
     return Scene((boxes,))
 
 
-def _columns(rows: Sequence[tuple[object, ...]]) -> list[F64Array]:
+def _swing(node: Node) -> Row:
+    """Return the values of Swing of a box; without the key, of none."""
+    if "swing" not in node.entries:
+        return (0.0, 0.0, 0.0), (0.0, 0.0, 1.0), 0.0, 0.0, 0.0
+    fields = node.entries["swing"].fields(_SWING_KEYS, required=_SWING_KEYS[:4])
+    axis = "xyz".index(fields["axis"].choice(tuple("xyz")))
+    return (
+        _vector(fields["pivot_m"]),
+        tuple(np.eye(3)[axis]),
+        _number(fields["amplitude_deg"], 0.0, 180.0) * RAD_PER_DEG,
+        _number(fields["frequency_hz"], 0.0, 50.0),
+        _optional(fields, "phase_deg", 0.0, -360.0, 360.0) * RAD_PER_DEG,
+    )
+
+
+def _columns(rows: Sequence[Row]) -> list[F64Array]:
     """Return one array per value of the rows."""
     return [np.array(column, np.float64) for column in zip(*rows, strict=True)]
 
@@ -428,24 +479,42 @@ def _stem(node: Node) -> tuple[object, ...]:
 
 
 def _forest(node: Node) -> Forest:
-    fields = node.fields(_FOREST_KEYS, required=("area_m", "per_hectare", "radius_m", "height_m"))
+    fields = node.fields(_FOREST_KEYS, required=("area_m", "per_hectare", "height_m"))
+    if not {"radius_m", "crown"} & set(fields):
+        raise node.error("radius_m of stems, crown, or both", "neither", "add one")
     x0, y0, x1, y1 = fields["area_m"].numbers(4)
     if not (x0 < x1 and y0 < y1):
         raise fields["area_m"].error("x0 < x1 and y0 < y1", "others", "swap the corners")
     return Forest(
         (x0, y0, x1, y1),
         _number(fields["per_hectare"], 0.0, 1e5),
-        _pair(fields["radius_m"]),
+        _pair(fields["radius_m"]) if "radius_m" in fields else None,
         _pair(fields["height_m"]),
         _optional(fields, "taper", 1.0, 0.0, 1.0),
         _optional(fields, "clearance_m", 1.5, 0.0, 100.0),
         _reflectivity(fields),
+        _crown(fields["crown"]) if "crown" in fields else None,
     )
 
 
-def _pair(node: Node) -> tuple[float, float]:
+def _crown(node: Node) -> CrownPlan:
+    fields = node.fields(_CROWN_KEYS, required=_CROWN_KEYS[:3])
+    wind = fields["wind"].fields(_WIND_KEYS, required=_WIND_KEYS) if "wind" in fields else {}
+    still = 0.0, 0.0
+    return CrownPlan(
+        _pair(fields["low_m"], 0.0),
+        _pair(fields["radius_m"]),
+        _pair(fields["extinction_per_m"]),
+        _pair(wind["amplitude_m"], 0.0) if wind else still,
+        _pair(wind["frequency_hz"], 0.0) if wind else still,
+        fields["flutter"].flag() if "flutter" in fields else True,
+        _reflectivity(fields, 50.0),
+    )
+
+
+def _pair(node: Node, least: float = _SMALL_M) -> tuple[float, float]:
     low, high = node.numbers(2)
-    if not _SMALL_M <= low <= high:
+    if not least <= low <= high:
         raise node.error("two sizes, the smaller first", f"{low:g} and {high:g}", "swap them")
     return low, high
 
@@ -454,8 +523,8 @@ def _pair(node: Node) -> tuple[float, float]:
 
 _LIDAR_KEYS = (
     *("name", "model", "mode", "rate_hz", "profile", "columns", "phase_deg", "extrinsics"),
-    *("address", "serial", "noise_m", "dropout", "loss", "max_range_m", "clock", "latency_s"),
-    *("jitter_s", "imu"),
+    *("address", "serial", "noise_m", "divergence_deg", "dropout", "loss", "max_range_m"),
+    *("clock", "latency_s", "jitter_s", "imu"),
 )
 _ERROR_KEYS = ("gyro_noise", "accel_noise", "gyro_bias", "accel_bias")
 _IMU_KEYS = ("name", "topic", "rate_hz", "extrinsics", "clock", *_ERROR_KEYS)
@@ -499,6 +568,7 @@ def _lidar(node: Node, number: int) -> LidarPlan:
         body_from_sensor=_extrinsics(fields),
         address=_address(fields, f"10.5.5.{87 + number}"),
         noise_m=_optional(fields, "noise_m", DEFAULT_NOISE_M, 0.0, 10.0),
+        divergence_rad=_optional(fields, "divergence_deg", 0.0, 0.0, 5.0) * RAD_PER_DEG,
         dropout=_optional(fields, "dropout", 0.0, 0.0, 1.0),
         loss=_optional(fields, "loss", 0.0, 0.0, 0.99),
         max_range_m=_optional(fields, "max_range_m", DEFAULT_RANGE_M, 1.0, 250.0),

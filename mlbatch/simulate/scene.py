@@ -10,66 +10,23 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from itertools import pairwise
 
 import numpy as np
 
 from mlbatch.arrays import F64Array, I64Array
+from mlbatch.simulate.foliage import Crowns
+from mlbatch.simulate.rays import NEAREST_M, Bounds, Rays
 from mlbatch.simulate.terrain import Terrain
 
-# A ray does not meet what is nearer to its origin.
-NEAREST_M = 1e-6
 _KEYS = 65536
 _KEYS_PER_RAD = _KEYS / (2.0 * math.pi)
 # Azimuths are cut to whole keys.
 _MARGIN_KEYS = 1.5
 _TINY = 1e-300
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Rays:
-    """n rays as rows of a (7, n) table: origin x, y, z (m), unit direction x, y, z, time (s)."""
-
-    table: F64Array
-
-    @classmethod
-    def of(cls, origin_m: F64Array, direction: F64Array, time_s: F64Array) -> Rays:
-        """Return rays of origins and directions (n, 3) and times (n,) since the start."""
-        table = np.empty((7, len(time_s)))
-        table[:3] = origin_m.T
-        table[3:6] = direction.T
-        table[6] = time_s
-        return cls(table)
-
-    def chosen(self, rows: I64Array) -> Rays:
-        """Return the rays of these numbers."""
-        return Rays(self.table.take(rows, axis=1))
-
-    @property
-    def origin_m(self) -> F64Array:
-        """Origins (3, n)."""
-        return self.table[:3]
-
-    @property
-    def direction(self) -> F64Array:
-        """Unit vectors (3, n)."""
-        return self.table[3:6]
-
-    @property
-    def time_s(self) -> F64Array:
-        """Times (n,) since the start."""
-        time_s: F64Array = self.table[6]
-        return time_s
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Bounds:
-    """Upright cylinders that contain k surfaces: centres (k, 2), radii, lowest, highest z (k,)."""
-
-    centre_m: F64Array
-    radius_m: F64Array
-    low_m: F64Array
-    high_m: F64Array
+# Crowns are met in these steps of distance.
+_SHELLS_M = (-math.inf, 4.0, 8.0, 14.0, 24.0, math.inf)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -151,11 +108,53 @@ class Stems:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class Swing:
+    """k sinusoidal turns about axes (k, 3), unit vectors, through pivots (k, 3).
+
+    amplitude_rad, frequency_hz, phase_rad: (k,).
+    """
+
+    pivot_m: F64Array
+    axis: F64Array
+    amplitude_rad: F64Array
+    frequency_hz: F64Array
+    phase_rad: F64Array
+
+    def bounds(self, centre_m: F64Array, radius_m: F64Array, time_s: tuple[float, float]) -> Bounds:
+        """Return what contains spheres around centres (3, k) while they swing for a short time."""
+        away = centre_m - self.pivot_m.T
+        angle = self._angle(np.arange(len(radius_m)), np.full(len(radius_m), 0.5 * sum(time_s)))
+        middle = self.pivot_m.T + _turned(away, self.axis.T, angle)
+        fastest = 2.0 * math.pi * self.frequency_hz * self.amplitude_rad
+        turned = 0.5 * fastest * (time_s[1] - time_s[0])
+        reach = radius_m + np.minimum(turned, 2.0) * np.sqrt(_dot(away, away))
+        return Bounds(middle[:2].T, reach, middle[2] - reach, middle[2] + reach)
+
+    def undone(self, index: I64Array, rays: Rays) -> Rays:
+        """Return rays (n,) as they are seen from what swings, at rest."""
+        moving = np.flatnonzero(self.amplitude_rad.take(index))
+        own = index[moving]
+        angle = -self._angle(own, rays.time_s[moving])
+        axis = self.axis.T.take(own, axis=1)
+        pivot = self.pivot_m.T.take(own, axis=1)
+        table = rays.table.copy()
+        table[:3, moving] = pivot + _turned(table[:3, moving] - pivot, axis, angle)
+        table[3:6, moving] = _turned(table[3:6, moving], axis, angle)
+        return Rays(table)
+
+    def _angle(self, index: I64Array, time_s: F64Array) -> F64Array:
+        """Return the angles (n,) of what swings at times (n,)."""
+        phase = 2.0 * math.pi * self.frequency_hz.take(index) * time_s + self.phase_rad.take(index)
+        angle: F64Array = self.amplitude_rad.take(index) * np.sin(phase)
+        return angle
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class Boxes:
     """k boxes, rotated about z, of constant velocity; from inside, a box is a room.
 
     centre_m: (k, 3) at the start; size_m: (k, 3); yaw_rad; velocity_mps: (k, 3); repeat_s: a box
-    returns to its first place after this time, inf for never.
+    returns to its first place after this time, inf for never; swing: of boxes that turn to and fro.
     """
 
     centre_m: F64Array
@@ -164,6 +163,7 @@ class Boxes:
     velocity_mps: F64Array
     repeat_s: F64Array
     reflectivity: F64Array
+    swing: Swing | None = field(default=None, kw_only=True)
 
     def centres(self, index: I64Array, time_s: F64Array) -> F64Array:
         """Return centres (3, n) of the boxes `index` (n,) at times (n,)."""
@@ -195,15 +195,15 @@ class Boxes:
         # A box that returns to its first place in this time may be at either end of its way.
         margin = np.where(np.isfinite(self.repeat_s) & (laps[0] != laps[1]), np.inf, 0.0)
         half = 0.5 * self.size_m[:, 2] + moved[2] + margin
-        return Bounds(
-            middle[:2].T,
-            radius + np.hypot(moved[0], moved[1]) + margin,
-            middle[2] - half,
-            middle[2] + half,
-        )
+        radius += np.hypot(moved[0], moved[1]) + margin
+        if self.swing is not None:
+            return self.swing.bounds(middle, np.hypot(radius, half), time_s)
+        return Bounds(middle[:2].T, radius, middle[2] - half, middle[2] + half)
 
     def meet(self, index: I64Array, rays: Rays) -> F64Array:
         """Return distances (n,) of rays (n,) to the surfaces `index` (n,); inf where they miss."""
+        if self.swing is not None:
+            rays = self.swing.undone(index, rays)
         x, y, z = rays.origin_m - self.centres(index, rays.time_s)
         dx, dy, dz = rays.direction
         cosine = np.cos(self.yaw_rad)[index]
@@ -229,14 +229,20 @@ class Boxes:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Scene:
-    """All surfaces."""
+    """All surfaces and leaves."""
 
     kinds: Sequence[Rectangles | Stems | Boxes]
     terrain: Terrain | None = None
     terrain_reflectivity: float = 0.0
+    foliage: Crowns | None = None
 
-    def cast(self, rays: Rays, max_range_m: float) -> tuple[F64Array, F64Array]:
-        """Return distances (n,) to the first surface, inf for none, and reflectivities (n,)."""
+    def cast(
+        self, rays: Rays, max_range_m: float, random: np.random.Generator | None = None
+    ) -> tuple[F64Array, F64Array]:
+        """Return distances (n,) to what rays meet first, inf for nothing, and reflectivities (n,).
+
+        random: of leaves that flutter; without, they are at rest.
+        """
         dx, dy, dz = rays.direction
         # Azimuths in [-pi, pi] as whole keys.
         keys = np.floor(np.arctan2(dy, dx) * _KEYS_PER_RAD)
@@ -251,19 +257,15 @@ class Scene:
         reflectivity = np.zeros(len(order))
         for kind in self.kinds:
             index, row = sight.candidates(kind.bounds(sight.span_s))
-            found = kind.meet(index, ordered.chosen(row))
-            nearer = np.flatnonzero(found < distance[row])
-            row = row[nearer]
-            index = index[nearer]
-            found = found[nearer]
-            np.minimum.at(distance, row, found)
-            first = found == distance[row]
-            reflectivity[row[first]] = kind.reflectivity[index[first]]
+            met = kind.meet(index, ordered.chosen(row))
+            _keep_nearest(met, row, kind.reflectivity[index], distance, reflectivity)
         if self.terrain is not None:
             found = self.terrain.cast(ordered.origin_m, ordered.direction, distance)
             hit = found < distance
             distance[hit] = found[hit]
             reflectivity[hit] = self.terrain_reflectivity
+        if self.foliage is not None:
+            _through_leaves(self.foliage, sight, distance, reflectivity, random)
         result = np.empty_like(distance)
         result[order] = np.where(distance < max_range_m, distance, np.inf)
         level = np.empty_like(reflectivity)
@@ -271,11 +273,45 @@ class Scene:
         return result, level
 
 
+def _keep_nearest(
+    met: F64Array, row: I64Array, level: F64Array, distance: F64Array, reflectivity: F64Array
+) -> None:
+    """Keep what is nearest to each ray; met, level: (n,) distances and reflectivities of `row`."""
+    nearer = np.flatnonzero(met < distance[row])
+    row = row[nearer]
+    met = met[nearer]
+    np.minimum.at(distance, row, met)
+    first = met == distance[row]
+    reflectivity[row[first]] = level[nearer[first]]
+
+
+def _through_leaves(
+    foliage: Crowns,
+    sight: _Sight,
+    distance: F64Array,
+    reflectivity: F64Array,
+    random: np.random.Generator | None,
+) -> None:
+    """Let leaves end rays; near crowns first, as most rays get no further."""
+    bounds = foliage.bounds(sight.span_s)
+    begins = sight.nearest(bounds)
+    for low_m, high_m in pairwise(_SHELLS_M):
+        rows = np.flatnonzero(distance > low_m)
+        crowns = np.flatnonzero((begins >= low_m) & (begins < high_m))
+        if len(rows) and len(crowns):
+            part = sight.part(rows)
+            index, row = part.candidates(bounds.chosen(crowns))
+            index = crowns[index]
+            met = foliage.meet(index, part.rays.chosen(row), random)
+            _keep_nearest(met, rows[row], foliage.reflectivity[index], distance, reflectivity)
+
+
 class _Sight:
     """Rays in the order of their azimuths, and which surfaces these can reach."""
 
     def __init__(self, rays: Rays, keys: F64Array, rise: F64Array, max_range_m: float) -> None:
         """keys: azimuths (n,), increasing; rise: (n,) change of height per horizontal metre."""
+        self.rays = rays
         self._keys = keys
         self._rise = rise
         self._height = rays.origin_m[2]
@@ -285,6 +321,17 @@ class _Sight:
         # Largest distance of an origin from the centre.
         self._spread = float(np.sqrt((away[0] * away[0] + away[1] * away[1]).max()))
         self.span_s = (float(rays.time_s.min()), float(rays.time_s.max()))
+
+    def part(self, rows: I64Array) -> _Sight:
+        """Return some of the rays, by increasing numbers."""
+        rays = self.rays.chosen(rows)
+        return _Sight(rays, self._keys[rows], self._rise[rows], self._max_range_m)
+
+    def nearest(self, bounds: Bounds) -> F64Array:
+        """Return horizontal distances (k,) from the origins, which no ray meets before them."""
+        x, y = (bounds.centre_m - self._centre).T
+        distance: F64Array = np.hypot(x, y) - bounds.radius_m - self._spread
+        return distance
 
     def candidates(self, bounds: Bounds) -> tuple[I64Array, I64Array]:
         """Return pairs of a surface and a ray that may meet, by azimuth and by height."""
@@ -328,6 +375,16 @@ class _Sight:
         end = [np.searchsorted(self._keys, high[rows] + turn, "right") for turn, rows in turns]
         first = np.concatenate(begin)
         return first, np.concatenate(end) - first, np.concatenate([rows for _, rows in turns])
+
+
+def _turned(vectors: F64Array, axis: F64Array, angle: F64Array) -> F64Array:
+    """Return vectors (3, n) turned about unit axes (3, n) by angles (n,): Rodrigues' formula."""
+    cosine, sine = np.cos(angle), np.sin(angle)
+    across = np.cross(axis, vectors, axis=0)
+    turned: F64Array = (
+        vectors * cosine + across * sine + axis * (_dot(axis, vectors) * (1.0 - cosine))
+    )
+    return turned
 
 
 def _dot(a: F64Array, b: F64Array) -> F64Array:

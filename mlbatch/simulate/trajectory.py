@@ -1,7 +1,8 @@
 """The motion of the body: smooth poses, their rates, and what an IMU feels; world frame, metres.
 
-Positions and yaw are natural cubic splines through waypoints; sway adds sinusoids to single
-coordinates. A standstill precedes them, and the speed then grows smoothly. Rotations are
+Positions and yaw are natural cubic splines through waypoints, or cubic curves that do not
+overshoot; sway adds sinusoids to single coordinates, the ground its height and its tilt. A
+standstill precedes them, and the speed then grows smoothly. Rotations are
 Rz(yaw) Ry(pitch) Rx(roll), as in URDF.
 """
 
@@ -10,10 +11,12 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TypeAlias
 
 import numpy as np
 
 from mlbatch.arrays import F64Array
+from mlbatch.simulate.terrain import Terrain
 from mlbatch.units import STANDARD_GRAVITY
 
 COORDINATES = ("x", "y", "z", "roll", "pitch", "yaw")
@@ -21,6 +24,8 @@ COORDINATES = ("x", "y", "z", "roll", "pitch", "yaw")
 RAMP_S = 1.0
 # Step of differences that give the angular acceleration.
 _STEP_S = 1e-4
+# Between knots of height and tilt of the ground.
+_GROUND_STEP_S = 0.2
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,12 +89,70 @@ class Spline:
         return value, np.where(moving, first, 0.0), np.where(moving, a * low2 + b * high2, 0.0)
 
 
+class MonotoneCurve:
+    """A cubic curve through values (k, m) at increasing knots (k,) that does not overshoot.
+
+    Between equal values it is constant, so that a body that stops stands still. Slopes by Fritsch
+    and Carlson (1980); the second derivative jumps at knots.
+    """
+
+    def __init__(self, knots: F64Array, values: F64Array) -> None:
+        """Compute the slopes; at both ends they are 0."""
+        self.knots = knots
+        self.values = values
+        self.slopes = np.zeros_like(values)
+        if len(knots) > 2:
+            step = np.diff(knots)[:, None]
+            change = np.diff(values, axis=0) / step
+            before, after = change[:-1], change[1:]
+            near = 2.0 * step[1:] + step[:-1]
+            far = step[1:] + 2.0 * step[:-1]
+            same = before * after > 0.0
+            # A weighted harmonic mean, 0 at an extremum.
+            with np.errstate(over="ignore"):
+                weights = near / np.where(same, before, 1.0) + far / np.where(same, after, 1.0)
+            self.slopes[1:-1] = np.where(same, (near + far) / weights, 0.0)
+
+    def __call__(self, at: F64Array) -> tuple[F64Array, F64Array, F64Array]:
+        """Return values and two derivatives, (n, m) each; constant outside the knots."""
+        if len(self.knots) == 1:
+            value = np.repeat(self.values, len(at), axis=0)
+            return value, np.zeros_like(value), np.zeros_like(value)
+        inside = np.clip(at, self.knots[0], self.knots[-1])
+        i = np.clip(np.searchsorted(self.knots, inside, "right") - 1, 0, len(self.knots) - 2)
+        step = (self.knots[i + 1] - self.knots[i])[:, None]
+        u = (inside - self.knots[i])[:, None] / step
+        low, rise = self.values[i], self.values[i + 1] - self.values[i]
+        begin, end = self.slopes[i] * step, self.slopes[i + 1] * step
+        # low + begin u + square u^2 + cube u^3.
+        square = 3.0 * rise - 2.0 * begin - end
+        cube = begin + end - 2.0 * rise
+        value = low + u * (begin + u * (square + u * cube))
+        first = (begin + u * (2.0 * square + 3.0 * u * cube)) / step
+        second = (2.0 * square + 6.0 * u * cube) / step**2
+        moving = (at == inside)[:, None]
+        return value, np.where(moving, first, 0.0), np.where(moving, second, 0.0)
+
+
+Curve: TypeAlias = Spline | MonotoneCurve
+
+
 class Trajectory:
     """Poses of the body at any time since the start, s."""
 
-    def __init__(self, path: Spline, sway: Sequence[Sway] = (), standstill_s: float = 0.0) -> None:
-        """path: (x, y, z, yaw) against the time since the standstill."""
+    def __init__(
+        self,
+        path: Curve,
+        sway: Sequence[Sway] = (),
+        standstill_s: float = 0.0,
+        ground: Curve | None = None,
+    ) -> None:
+        """path: (x, y, z, yaw) against the time since the standstill.
+
+        ground: (z, roll, pitch) of the ground below the body, which are added.
+        """
         self._path = path
+        self._ground = ground
         self._sway = tuple(sway)
         self._standstill_s = standstill_s
 
@@ -130,6 +193,9 @@ class Trajectory:
         for part, path in zip(parts, self._path(own), strict=True):
             part[:, :3] = path[:, :3]
             part[:, 5] = path[:, 3]
+        if self._ground is not None:
+            for part, ground in zip(parts, self._ground(own), strict=True):
+                part[:, 2:5] += ground
         for sway in self._sway:
             pulse = 2.0 * math.pi * sway.frequency_hz
             phase = pulse * own + sway.phase_rad
@@ -173,10 +239,35 @@ def _body_rates(rpy_rad: F64Array, change: F64Array) -> F64Array:
     return np.stack(rates, axis=-1)
 
 
-def path_from_waypoints(time_s: F64Array, xyz_m: F64Array, yaw_rad: F64Array | None) -> Spline:
-    """Return the spline (x, y, z, yaw) through waypoints; without yaw, the body looks ahead."""
+def path_from_waypoints(
+    time_s: F64Array, xyz_m: F64Array, yaw_rad: F64Array | None, kind: type[Curve] = Spline
+) -> Curve:
+    """Return the curve (x, y, z, yaw) through waypoints; without yaw, the body looks ahead."""
     if yaw_rad is None:
         _, ahead, _ = Spline(time_s, xyz_m)(time_s)
         moves = np.hypot(ahead[:, 0], ahead[:, 1]) > 1e-9
         yaw_rad = np.where(moves, np.arctan2(ahead[:, 1], ahead[:, 0]), 0.0)
-    return Spline(time_s, np.column_stack([xyz_m, np.unwrap(yaw_rad)]))
+    return kind(time_s, np.column_stack([xyz_m, np.unwrap(yaw_rad)]))
+
+
+def ground_along(path: Curve, terrain: Terrain, footprint_m: float) -> Curve:
+    """Return (z, roll, pitch) of a body that rests on a disc of the terrain, along its path.
+
+    The plane of the disc is fitted to its centre and 8 places on its edge, so that bumps that are
+    small against the machine tilt it little.
+    """
+    time_s = np.arange(0.0, path.knots[-1] + _GROUND_STEP_S, _GROUND_STEP_S)
+    value, _, _ = path(time_s)
+    angle = np.arange(9) * (math.pi / 4.0)
+    around = 0.5 * footprint_m * np.column_stack([np.cos(angle), np.sin(angle)])
+    around[8] = 0.0
+    places = value[:, None, :2] + around
+    height = terrain.height(places.reshape(-1, 2)).reshape(-1, 9)
+    # Least squares: the places are symmetric about the centre.
+    slope = height @ around / (around**2).sum(axis=0)
+    cosine, sine = np.cos(value[:, 3]), np.sin(value[:, 3])
+    ahead = slope[:, 0] * cosine + slope[:, 1] * sine
+    left = slope[:, 1] * cosine - slope[:, 0] * sine
+    roll = np.arcsin(left / np.sqrt(1.0 + ahead**2 + left**2))
+    table = np.column_stack([height.mean(axis=1), roll, -np.arctan(ahead)])
+    return MonotoneCurve(time_s, table)

@@ -50,6 +50,29 @@ def mistake(folder: Path, text: str) -> str:
             "body:\n  - {centre_m: [0, 0, 0], size_m: [1, 1, 1]}\nsensors:\n",
             r"body\[0\]: expected a box without a lidar in it, found one",
         ),
+        ("motion:\n", "motion:\n  footprint_m: 3\n", "footprint_m: expected a scene with terrain"),
+        (
+            "motion:\n",
+            "motion:\n  interpolation: cubic\n",
+            "expected spline or monotone, found 'cu",
+        ),
+        (
+            "sensors:\n",
+            "  forest: [{area_m: [0, 0, 9, 9], per_hectare: 9, height_m: [1, 2]}]\nsensors:\n",
+            r"forest\[0\]: expected radius_m of stems, crown, or both, found neither; add one",
+        ),
+        (
+            "sensors:\n",
+            "  forest: [{area_m: [0, 0, 9, 9], per_hectare: 9, height_m: [1, 2], crown: {low_m: "
+            "[0, 1], radius_m: [1, 2], extinction_per_m: [2, 1]}}]\nsensors:\n",
+            r"crown\.extinction_per_m: expected two sizes, the smaller first, found 2 and 1; swap",
+        ),
+        (
+            "sensors:\n",
+            "body:\n  - {centre_m: [0, 0, -1], size_m: [1, 1, 1], swing: {pivot_m: [0, 0, 0], "
+            "axis: yaw, amplitude_deg: 5, frequency_hz: 1}}\nsensors:\n",
+            r"body\[0\]\.swing\.axis: expected x or y or z, found 'yaw'",
+        ),
         ("sensors:\n", "body: []\nsensors:\n", "body: expected at least one box, found"),
         (
             "sensors:\n",

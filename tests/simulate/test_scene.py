@@ -11,7 +11,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from mlbatch.arrays import F64Array
-from mlbatch.simulate.scene import Boxes, Rays, Rectangles, Scene, Stems
+from mlbatch.simulate.rays import Rays
+from mlbatch.simulate.scene import Boxes, Rectangles, Scene, Stems, Swing
 from tests.builders.scene import Pillar, Rectangle
 from tests.builders.scene import Scene as PlainScene
 from tests.builders.scene import box as plain_box
@@ -167,3 +168,39 @@ def test_culling_loses_no_hit_of_a_moving_box(begin_s: float) -> None:
     found, _ = Scene((moving,)).cast(rays, 60.0)
     np.testing.assert_array_equal(found, np.where(expected < 60.0, expected, np.inf))
     assert 10 < np.isfinite(found).sum() < len(found) / 2
+
+
+def swinging(box: Boxes, axis: Vector, amplitude_deg: float, frequency_hz: float) -> Boxes:
+    """A box that swings about the origin."""
+    rows = (amplitude_deg * math.pi / 180, frequency_hz, 0.0)
+    swing = Swing(np.zeros((1, 3)), np.array([axis], np.float64), *(np.array([v]) for v in rows))
+    return replace(box, swing=swing)
+
+
+@pytest.mark.parametrize(
+    ("axis", "direction"), [((0, 0, 1), (0, 1, 0)), ((0, 1, 0), (0, 0, -1)), ((1, 0, 0), (1, 0, 0))]
+)
+def test_a_box_that_swings_is_seen_where_it_has_turned_to(axis: Vector, direction: Vector) -> None:
+    """A cube at 3 m ahead, turned by 90 degrees after a quarter of 4 s, by the right-hand rule."""
+    box = swinging(boxes((3, 0, 0), (1, 1, 1)), axis, 90, 0.25)
+    assert cast_one(box, (0, 0, 0), (1, 0, 0), time_s=0.0) == pytest.approx(2.5)
+    assert cast_one(box, (0, 0, 0), direction, time_s=1.0) == pytest.approx(2.5)
+    if direction != (1, 0, 0):
+        assert cast_one(box, (0, 0, 0), (1, 0, 0), time_s=1.0) == math.inf
+
+
+@given(st.integers(0, 100))
+def test_culling_loses_no_hit_of_a_box_that_swings(seed: int) -> None:
+    """Rays of a tenth of a second together, and one by one, which bounds its place exactly."""
+    random = np.random.default_rng(seed)
+    axis = random.standard_normal(3)
+    box = swinging(
+        boxes(tuple(random.uniform(-4, 4, 3)), (1, 2, 0.5)),
+        tuple(axis / np.linalg.norm(axis)), random.uniform(5, 120), random.uniform(0.1, 2),
+    )  # fmt: skip
+    origin, direction = fan(seed)
+    times = random.uniform(3.0, 3.1, len(origin))
+    together, _ = Scene((box,)).cast(Rays.of(origin, direction, times), 40.0)
+    every = np.arange(len(origin))
+    met = box.meet(0 * every, Rays.of(origin, direction, times))
+    np.testing.assert_array_equal(together, np.where(met < 40.0, met, np.inf))

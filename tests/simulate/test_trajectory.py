@@ -6,13 +6,19 @@ import math
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from mlbatch.arrays import F64Array
+from mlbatch.simulate.terrain import Terrain
 from mlbatch.simulate.trajectory import (
     RAMP_S,
+    Curve,
+    MonotoneCurve,
     Spline,
     Sway,
     Trajectory,
+    ground_along,
     path_from_waypoints,
 )
 from mlbatch.units import STANDARD_GRAVITY
@@ -21,7 +27,7 @@ from mlbatch.units import STANDARD_GRAVITY
 UP = np.array([0.0, 0.0, STANDARD_GRAVITY])
 
 
-def path(*rows: tuple[float, ...]) -> Spline:
+def path(*rows: tuple[float, ...]) -> Curve:
     table = np.array(rows, np.float64)
     yaw = np.radians(table[:, 4]) if table.shape[1] == 5 else None
     return path_from_waypoints(table[:, 0], table[:, 1:4], yaw)
@@ -129,3 +135,62 @@ def test_the_specific_force_is_that_of_the_place_of_the_imu() -> None:
     expected = np.einsum("nji,nj->ni", WINDING.poses(times).rotation, felt)
     force, _ = WINDING.inertial(times, place)
     np.testing.assert_allclose(force, expected, atol=2e-3)
+
+
+@given(st.lists(st.tuples(st.floats(0.1, 5), st.floats(-9, 9)), min_size=1, max_size=8))
+def test_a_monotone_curve_does_not_leave_the_values_of_its_knots(
+    rows: list[tuple[float, float]],
+) -> None:
+    knots = np.cumsum([step for step, _ in rows])
+    values = np.array([[value] for _, value in rows])
+    curve = MonotoneCurve(knots, values)
+    np.testing.assert_allclose(curve(knots)[0], values, atol=1e-12)
+    for low, high, first, last in zip(knots, knots[1:], values[:, 0], values[1:, 0], strict=False):
+        between = curve(np.linspace(low, high, 50))[0][:, 0]
+        assert between.min() >= min(first, last) - 1e-9
+        assert between.max() <= max(first, last) + 1e-9
+        assert (np.diff(between) * np.sign(last - first) >= -1e-9).all()
+
+
+def test_derivatives_of_a_monotone_curve_are_those_of_its_values() -> None:
+    curve = MonotoneCurve(np.array([0.0, 1, 3, 4, 6]), np.array([[0.0], [2], [2], [5], [6]]))
+    times, step = np.linspace(0.013, 5.987, 210), 1e-6
+    (_, first, second), (high, later, _), (low, earlier, _) = (
+        curve(times + shift) for shift in (0.0, step, -step)
+    )
+    np.testing.assert_allclose(first, (high - low) / (2 * step), atol=1e-6)
+    np.testing.assert_allclose(second, (later - earlier) / (2 * step), atol=1e-4)
+
+
+def test_a_monotone_curve_stands_still_between_equal_waypoints() -> None:
+    rows = ((0, 0, 0, 0, 0), (4, 3, 0, 0, 0), (6, 3, 0, 0, 40), (8, 3, 0, 0, 0), (12, 0, 0, 0, 0))
+    table = np.array(rows, np.float64)
+    curve = path_from_waypoints(table[:, 0], table[:, 1:4], np.radians(table[:, 4]), MonotoneCurve)
+    poses = Trajectory(curve).poses(np.linspace(4.0, 8.0, 41))
+    assert (poses.position_m == [3, 0, 0]).all()
+    assert (poses.velocity == 0).all()
+    # It slews meanwhile, and no further than 40 degrees.
+    heading = np.degrees(np.arctan2(poses.rotation[:, 1, 0], poses.rotation[:, 0, 0]))
+    assert heading.max() == pytest.approx(40.0)
+    assert heading[20] == pytest.approx(40.0)
+
+
+def plane(by_x: float, by_y: float) -> Terrain:
+    place = np.linspace(-20, 20, 41)
+    return Terrain(1.0 + by_x * place[:, None] + by_y * place[None, :], 1.0, 20.0)
+
+
+@pytest.mark.parametrize("yaw_deg", [0.0, 35.0, 90.0, -120.0])
+def test_a_body_on_a_slope_is_tilted_as_the_slope_is(yaw_deg: float) -> None:
+    """Its z axis is the normal of z = 1 + 0.2 x - 0.1 y, (-0.2, 0.1, 1) / |.|, at every heading."""
+    curve = path((0, -3, 2, 0.5, yaw_deg), (9, 4, 1, 0.5, yaw_deg))
+    ground = ground_along(curve, plane(0.2, -0.1), footprint_m=3.0)
+    times = np.linspace(0, 9, 30)
+    poses = Trajectory(curve, ground=ground).poses(times)
+    normal = np.array([-0.2, 0.1, 1.0]) / math.sqrt(1.05)
+    np.testing.assert_allclose(poses.rotation[:, :, 2], np.tile(normal, (30, 1)), atol=1e-6)
+    x, y, z = poses.position_m.T
+    np.testing.assert_allclose(z, 1.5 + 0.2 * x - 0.1 * y, atol=1e-2)
+    # A horizontal heading along its yaw.
+    ahead = poses.rotation[:, :, 0]
+    np.testing.assert_allclose(np.degrees(np.arctan2(ahead[:, 1], ahead[:, 0])), yaw_deg, atol=1e-6)
