@@ -11,7 +11,10 @@ import typer
 def simulate(
     scenario: Annotated[
         str,
-        typer.Argument(help="Scenario file (YAML), or room, street, forest-easy, forest-hard."),
+        typer.Argument(
+            help="Scenario file (YAML), or room, street, forest-easy, forest-hard, "
+            "harvester-easy, harvester-hard."
+        ),
     ],
     output: Annotated[
         Path, typer.Option("-o", "--output", help="Recording to write: .pcap, .mcap or .db3.")

@@ -20,7 +20,15 @@ from mlbatch.rig.rig import read_rig
 from mlbatch.simulate.recording import write_recording
 from mlbatch.simulate.scenario import SHIPPED, read_scenario, shipped
 from mlbatch.units import STANDARD_GRAVITY
-from tests.builders.simulated import Recorded, read_tum, record, residuals, scenario_text
+from tests.builders.simulated import (
+    Recorded,
+    at_true_poses,
+    distance_to_scene,
+    read_tum,
+    record,
+    residuals,
+    scenario_text,
+)
 
 TWO = """\
   - name: left
@@ -66,7 +74,46 @@ def test_points_of_shipped_scenarios_lie_on_the_scene(name: str, tmp_path: Path)
     assert np.median(distances) < noise_m
 
 
-@pytest.mark.parametrize("name", ["forest-easy", "forest-hard", "room", "street"])
+def test_points_of_the_harvester_lie_on_the_scene_or_in_its_leaves(tmp_path: Path) -> None:
+    """Beams without a width; without the machine itself, whose box covers its swinging boom."""
+    text = (SHIPPED / "harvester-hard.yaml").read_text(encoding="utf-8")
+    text = text.replace("standstill_s: 2", "standstill_s: 0").replace("OS0-128", "OS0-32")
+    text = text.replace("divergence_deg: 0.35", "divergence_deg: 0") + "truth: {rate_hz: 1000}\n"
+    # Fewer plants and points: a minute otherwise.
+    for old, new in (("2000", "400"), ("3000", "600"), ("duration_s: 115", "duration_s: 0.4")):
+        text = text.replace(old, new)
+    recorded = record(tmp_path, text.replace("OS0-32", "OS0-32\n    columns: 512"))
+    foliage = recorded.scenario.scene.foliage
+    assert foliage is not None
+    leaves = points = 0
+    for scan in recorded.scans():
+        own = scan.xyz.astype(np.float64)
+        machine = ((own > [-4, -2.5, 0]) & (own < [8.5, 2.5, 5])).all(axis=1)
+        time_ns = np.add(scan.time_ns, scan.start_ns, dtype=np.int64)[~machine]
+        world = at_true_poses(own[~machine], time_ns, recorded.truth)
+        time_s = (time_ns - recorded.scenario.start_ns) / 1e9
+        away = distance_to_scene(recorded.scenario.scene, world, time_s)
+        in_air = world[away > 5e-3 + 6 * 0.01]
+        # In the ellipsoid of a crown, wherever the wind has moved it, and 6 cm of noise around.
+        offset = in_air[:, None] - foliage.centre_m
+        wide = foliage.radius_m + foliage.wind_m + 0.06
+        share = (offset[..., :2] ** 2).sum(axis=2) / wide**2
+        share += (offset[..., 2] / (foliage.half_height_m + 0.06)) ** 2
+        assert (share <= 1.0).any(axis=1).all()
+        leaves += len(in_air)
+        points += len(world)
+    assert points > 5_000
+    assert 0.1 < leaves / points < 0.9
+
+
+NAMES = ["forest-easy", "forest-hard", "harvester-easy", "harvester-hard", "room", "street"]
+
+
+def test_all_shipped_scenarios_are_tested() -> None:
+    assert list(shipped()) == NAMES
+
+
+@pytest.mark.parametrize("name", NAMES)
 def test_shipped_scenarios_last_over_a_minute(name: str) -> None:
     assert read_scenario(name, duration_s=60.0).duration_s == 60.0
 
