@@ -294,15 +294,6 @@ def test_recordings_are_neither_denied_nor_kept_secret() -> None:
     assert not real & {name for cell in denied for name in cell.split(", ")}
 
 
-def test_every_module_is_on_the_map() -> None:
-    page = _page("architecture.md")
-    for path in PACKAGE.iterdir():
-        if path.is_dir() and (path / "__init__.py").exists():
-            assert f"`{path.name}/`" in page, path.name
-        elif path.suffix == ".py" and not path.name.startswith("_"):
-            assert f"`{path.name}`" in page, path.name
-
-
 def test_the_example_of_a_writer_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Saved in a folder of formats, as the page says, it is found and writes every point."""
     (example,) = re.findall(r"^```python\n(.*?)^```$", _page("extend.md"), re.M | re.S)
