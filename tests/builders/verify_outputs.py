@@ -14,7 +14,6 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-import pytest
 
 from mlbatch.verification import Verdict, verify
 from tests.builders.run import TWO_LIDARS, command
@@ -22,10 +21,6 @@ from tests.builders.run import TWO_LIDARS, command
 Values = npt.NDArray[Any]
 Arrays = dict[str, Values]
 Edit = Callable[[Path], None]
-# An edit, and check and place of the violation that is expected.
-Case = tuple[Edit, str, str]
-
-PERIOD_NS = 100_000_000
 # Head and three windows of the fixture; near points only, to keep files small.
 COMMON = ("--keep-partial", "--end", "+0.3", "--max-range", "9", "--quiet")
 KINDS: dict[str, tuple[str, ...]] = {
@@ -89,22 +84,6 @@ def damaged(kind: str, folder: Path, edit: Edit) -> Verdict:
     return verify(path)
 
 
-def cases(tables: dict[str, dict[str, Case]]) -> list[Any]:
-    """Parameters of a test, from tables of cases by kind of output."""
-    return [
-        pytest.param(kind, case, id=f"{kind}-{name}")
-        for kind, table in tables.items()
-        for name, case in table.items()
-    ]
-
-
-def check_case(kind: str, case: Case, folder: Path) -> None:
-    """The edit gives a violation of this check that names this place."""
-    edit, check, where = case
-    places = [(one.check, one.where) for one in damaged(kind, folder, edit).violations]
-    assert any(name == check and where in place for name, place in places), places
-
-
 # -- edits ----------------------------------------------------------------------------------------
 
 
@@ -118,35 +97,6 @@ def arrays(name: str, change: Callable[[Arrays], None]) -> Edit:
         np.savez(folder / name, **found)
 
     return edit
-
-
-def npz(name: str, key: str, change: Callable[[Values], Values]) -> Edit:
-    """Change an array of a scan."""
-
-    def changed(found: Arrays) -> None:
-        found[key] = change(found[key].copy())
-
-    return arrays(name, changed)
-
-
-def at(place: Any, value: Any) -> Callable[[Values], Values]:
-    """Put a value at a place."""
-
-    def change(values: Values) -> Values:
-        values[place] = value
-        return values
-
-    return change
-
-
-def plus(place: Any, value: Any) -> Callable[[Values], Values]:
-    """Add a value at a place."""
-    return lambda values: at(place, values[place].item() + value)(values)
-
-
-def swapped(first: int, second: int) -> Callable[[Values], Values]:
-    """Exchange two values."""
-    return lambda values: at([first, second], values[[second, first]])(values)
 
 
 def row(line: int, column: str, value: object) -> Edit:

@@ -12,7 +12,8 @@ from mlbatch.cli.verify import SHOWN
 from mlbatch.outputs.file_formats import FILE_FORMATS
 from mlbatch.verification import CHECKS
 from tests.builders.run import ROOT, command
-from tests.builders.verify_outputs import Arrays, arrays, copied, made, npz, plus
+from tests.builders.verify_outputs import Arrays, arrays, copied, made
+from tests.verification.edits import edit_of
 
 
 def test_a_clean_output(tmp_path: Path) -> None:
@@ -27,7 +28,7 @@ def test_a_clean_output(tmp_path: Path) -> None:
 
 def test_a_violation_names_its_place(tmp_path: Path) -> None:
     path = copied("npz", tmp_path)
-    npz("000001.npz", "start_ns", plus((), 1))(path)
+    edit_of("add 000001.npz start_ns () 1")(path)
     result = command("verify", path)
     assert result.code == 1
     values = "expected 1777881600200000000, found 1777881600200000001"

@@ -1,81 +1,29 @@
-"""Kinds of outputs; outputs that cannot be checked are refused in one line."""
+"""What a verdict says of outputs that lack a part, are rewritten, or compressed."""
 
 from __future__ import annotations
 
+import importlib
 import shutil
+import tracemalloc
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+import zstandard
 
+from mlbatch.outputs.damage import CheckLog, DamageError
+from mlbatch.outputs.mcap_file import unpacked
+from mlbatch.outputs.metadata import metadata_of_grid
 from mlbatch.verification import VerifyError, verify
-from tests.builders.verify_outputs import (
-    Edit,
-    both,
-    copied,
-    damaged,
-    flipped,
-    made,
-    raw,
-    removed,
-    renamed,
-    text,
-)
+from tests.builders.rewritten_outputs import bag, mcap
+from tests.builders.verify_outputs import copied, damaged, made
+from tests.verification.edits import edit_of
 
-
-def emptied(folder: Path) -> None:
-    for file in folder.iterdir():
-        file.unlink()
-
-
-NPZ_NAMES = ("head", "000000", "000001", "000002")
-NOTHING: dict[str, tuple[str, Edit, str]] = {
-    "no such output": ("npz", shutil.rmtree, "no such file or folder"),
-    "empty folder": ("npz", emptied, "an empty folder"),
-    "folder without scans": (
-        "npz",
-        both(*(removed(f"{name}.npz") for name in NPZ_NAMES)),
-        "a folder without scans",
-    ),
-    "scans of strange names": (
-        "npz",
-        both(*(renamed(f"{name}.npz", f"x{name}.npz") for name in NPZ_NAMES)),
-        "strange names",
-    ),
-    "first scan damaged": ("npz", raw("head.npz", lambda data: b"PK"), "restore the first scan"),
-    "rate that is none": (
-        "ply",
-        text("head.ply", "rate_hz 10", "rate_hz ten"),
-        "a positive number of Hz",
-    ),
-    "report that is no JSON": ("npz", text("report.json", "{", "["), "a report in JSON"),
-    "empty file": ("scans.mcap", raw("", lambda data: b""), "an empty file"),
-    "other file": ("scans.mcap", raw("", lambda data: b"abc"), "a file of another kind"),
-    "damaged MCAP": ("scans.mcap", raw("", lambda data: data[:200_000]), "a whole MCAP file"),
-    "foreign MCAP": (
-        "scans.mcap",
-        raw("", lambda data: data[:8] + bytes(100)),
-        "a whole MCAP file",
-    ),
-    "no grid": ("scans.mcap", text("", "mlbatch.grid", "mlbatch.gird"), "mlbatch.grid"),
-    "damaged bag": ("scans.bag", raw("", lambda data: data[:200_000]), "convert again"),
-    "other metadata.yaml": (
-        "bag2",
-        text("metadata.yaml", "  version", "  a: &a [1]\n  b: [*a, *a]\n  version"),
-        "an alias",
-    ),
-    "bag without scans": ("bag2", removed("bag2_0.mcap"), "a bag with MCAP files, found none"),
-    "other file of a bag": ("bag2", raw("bag2_0.mcap", flipped(0)), "an MCAP file, found another"),
-    "metadata that is no YAML": ("bag2", text("metadata.yaml", "version", "\t{"), "expected YAML"),
+MB = 1 << 20
+PACK: dict[str, Callable[[bytes], bytes]] = {
+    "zstd": zstandard.ZstdCompressor().compress,
+    "lz4": importlib.import_module("lz4.frame").compress,
 }
-
-
-@pytest.mark.parametrize("name", NOTHING)
-def test_refused_in_one_line(name: str, tmp_path: Path) -> None:
-    kind, edit, words = NOTHING[name]
-    with pytest.raises(VerifyError, match=words) as error:
-        damaged(kind, tmp_path, edit)
-    assert "\n" not in str(error.value)
-    assert str(tmp_path) in str(error.value)
 
 
 def test_unfinished_outputs_are_refused(tmp_path: Path) -> None:
@@ -106,3 +54,61 @@ def test_a_bag_alone_is_partly_checkable(tmp_path: Path) -> None:
     assert verdict.ok
     limited = {check.name for check in verdict.checks if check.outcome == "not checkable"}
     assert {"grid", "index", "t_init", "columns", "table", "ledger", "report"} <= limited
+
+
+@pytest.mark.parametrize("kind", ["kitti", "nuscenes"])
+def test_without_a_report_the_grid_is_unknown(kind: str, tmp_path: Path) -> None:
+    verdict = damaged(kind, tmp_path, edit_of("remove report.json"))
+    assert verdict.ok
+    outcomes = {check.name: check.outcome for check in verdict.checks}
+    assert outcomes["grid"] == outcomes["report"] == "not checkable"
+
+
+def test_numbers_that_python_refuses_are_none() -> None:
+    log = CheckLog()
+    metadata = metadata_of_grid(log, "out.mcap", {"slices": "9" * 5000, "t_init_ns": "9" * 19})
+    assert (metadata.slices, metadata.t_init_ns) == (None, 10**19 - 1)
+    assert "out.mcap mlbatch.grid slices" in [one.where for one in log.violations]
+
+
+def test_frames_are_named_in_order(tmp_path: Path) -> None:
+    """The order in a set depends on the process."""
+    edit = edit_of("message /tf_static 0 words base cars")
+    found = {one.where: one for one in damaged("scans.mcap", tmp_path, edit).violations}
+    root = found["scans.mcap /tf_static message 0 root"]
+    assert (root.expected, root.found) == ("['base_link']", "['base_link', 'cars_link']")
+
+
+@pytest.mark.parametrize(
+    "kind", ["scans.mcap", "split.mcap", "organized.mcap", "bag2", "scans.bag"]
+)
+def test_rewritten_files_are_clean(kind: str, tmp_path: Path) -> None:
+    verdict = damaged(kind, tmp_path, bag(lambda sent: [sent]) if kind == "scans.bag" else mcap())
+    assert verdict.ok, verdict.violations
+
+
+@pytest.mark.parametrize("name", PACK)
+def test_compressed_chunks_are_checked_alike(name: str) -> None:
+    plain, packed = verify(made("scans.mcap")), verify(made(f"{name}.mcap"))
+    assert packed.ok, packed.violations
+    assert [(one.name, one.checked) for one in packed.checks] == [
+        (one.name, one.checked) for one in plain.checks
+    ]
+    assert made(f"{name}.mcap").stat().st_size < made("scans.mcap").stat().st_size
+
+
+@pytest.mark.parametrize("name", PACK)
+def test_declared_sizes_bound_memory(name: str) -> None:
+    """256 MB of zeros in a chunk."""
+    packed = PACK[name](bytes(256 * MB))
+    tracemalloc.start()
+    try:
+        with pytest.raises(DamageError):
+            unpacked(name, packed, 1000)
+        with pytest.raises(DamageError):
+            unpacked(name, packed[: len(packed) // 100], 300 * MB * 256)
+        _, most = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert most < 8 * MB
+    assert len(unpacked(name, packed, 256 * MB)) == 256 * MB
