@@ -23,13 +23,24 @@ Reference: TypeAlias = dict[str, npt.NDArray[Any]]
 
 @dataclass(frozen=True)
 class Case:
-    """A recording of one sensor: its metadata, and the source address where it has two."""
+    """A recording of a sensor, its metadata, what the vendor's decoder made of it.
+
+    source, only: address and serial number of a sensor that is not alone.
+    """
 
     folder: str
     capture: str
     metadata: str
     reference: str = "reference.npz"
     source: str = ""
+    only: str = ""
+
+    def __str__(self) -> str:
+        return f"{self.folder} {self.only}".strip()
+
+    @property
+    def path(self) -> Path:
+        return OUSTER / self.folder / self.capture
 
     @property
     def metadata_path(self) -> Path:
@@ -43,58 +54,58 @@ class Case:
         """(n, size) payloads of this size, from the case's source."""
         found = [
             data
-            for source, _port, data in datagrams(OUSTER / self.folder / self.capture)
+            for source, _port, data in datagrams(self.path)
             if len(data) == size and self.source in ("", source)
         ]
         return np.array([np.frombuffer(data, np.uint8) for data in found]).reshape(-1, size)
 
 
-_SAME = "two-sensors_same-ports"
-CASES = (
-    Case("os0-128_512x10_crc", "crc_test.pcap", "crc_test.json"),
-    Case(
-        "os0-128_v2.3.0_rng15",
-        "OS-0-128-U1_v2.3.0_1024x10.pcap",
-        "OS-0-128-U1_v2.3.0_1024x10.json",
-    ),
+def named(folder: str, stem: str) -> Case:
+    """A recording whose metadata have its name."""
+    return Case(folder, f"{stem}.pcap", f"{stem}.json")
+
+
+def twins(kind: str) -> tuple[Case, Case]:
+    """The sensors of a recording of two: OS-0-128 and OS-1-64-AH."""
+    first, second = (
+        Case(
+            f"two-sensors_same-ports_{kind}",
+            f"same_ports_{kind}.pcap",
+            f"same_ports_{kind}.{number}.json",
+            *(f"reference.{number}.npz", source, serial),
+        )
+        for number, source, serial in (
+            *((1, "169.254.92.158", "122247000785"), (2, "169.254.238.111", "122239000672")),
+        )
+    )
+    return first, second
+
+
+OS0_32 = "OS-0-32-U1_v2.2.0_1024x10"
+SINGLES = (
+    named("os0-128_512x10_crc", "crc_test"),
+    named("os0-128_v2.3.0_rng15", "OS-0-128-U1_v2.3.0_1024x10"),
     Case("os0-128_windowed", "windowed_frame1.pcap", "windowed_frame1_0.json"),
-    Case(
-        "os0-32_v2.2.0_rng19-dual",
-        "OS-0-32-U1_v2.2.0_1024x10.pcap",
-        "OS-0-32-U1_v2.2.0_1024x10.json",
-    ),
-    Case(
-        "os0-32_v2.2.0_single-packet",
-        "OS-0-32-U1_v2.2.0_1024x10-single-packet.pcap",
-        "OS-0-32-U1_v2.2.0_1024x10.json",
-    ),
+    named("os0-32_v2.2.0_rng19-dual", OS0_32),
+    Case("os0-32_v2.2.0_single-packet", f"{OS0_32}-single-packet.pcap", f"{OS0_32}.json"),
     Case(
         "os1-128_v2.3.0_rng15_3frames",
         "OS-1-128_v2.3.0_1024x10_lb_n3.pcap",
         "OS-1-128_v2.3.0_1024x10.json",
     ),
-    Case(
-        "os1-32-g_v2.1.1_legacy", "OS-1-32-G_v2.1.1_1024x10.pcap", "OS-1-32-G_v2.1.1_1024x10.json"
-    ),
-    Case("os1-64_fw1_legacy_broadcast", "ouster_example.pcap", "ouster_example.json"),
+    named("os1-32-g_v2.1.1_legacy", "OS-1-32-G_v2.1.1_1024x10"),
+    named("os1-64_fw1_legacy_broadcast", "ouster_example"),
     Case(
         "os1-64_fw2.0_legacy_reduced-config",
         "OS-1-64_1024x10_fw20.pcap",
         "OS-1-64_sensor_config_reduced.json",
     ),
-    Case("os2-128_duplicate-ip-id", "duplicate_id.pcap", "duplicate_id.json"),
-    *(
-        Case(
-            f"{_SAME}_{kind}",
-            f"same_ports_{kind}.pcap",
-            f"same_ports_{kind}.{number}.json",
-            f"reference.{number}.npz",
-            source,
-        )
-        for kind in ("legacy", "nonlegacy")
-        for number, source in ((1, "169.254.92.158"), (2, "169.254.238.111"))
-    ),
+    named("os2-128_duplicate-ip-id", "duplicate_id"),
 )
+PAIRS = (twins("legacy"), twins("nonlegacy"))
+CASES = (*SINGLES, *(case for pair in PAIRS for case in pair))
+# Its lidar is off.
+ONLY_IMU = Case("os0-128_imu-zone-no-lidar", "imu_zm_no_lidar.pcap", "imu_zm_no_lidar_0.json")
 
 
 def datagrams(capture: Path) -> Iterator[tuple[str, int, bytes]]:

@@ -8,8 +8,10 @@ import numpy as np
 import pytest
 
 from mlbatch.lidar.geometry import read_rotor_words
+from mlbatch.sensors import read_calibration
 from mlbatch.sensors.hesai.angles import read_angles, read_at128
 from mlbatch.sensors.velodyne.calibration import VelodyneFile
+from mlbatch.simulate.velodyne.models import MODELS
 from tests.builders.decoded import projected
 from tests.builders.rotor import rotor_words
 from tests.recordings import RECORDINGS
@@ -19,13 +21,14 @@ from tests.sensors.velodyne.test_geometry import check_many_points
 
 VELODYNE_FOLDER = RECORDINGS / "velodyne"
 # Real files: the first lines, read by eye; angles of docs/sources/velodyne.md section 6.
+ALONE = "calibration-without-recording"
 VELODYNE = {
-    "vlp16_ros2_dual/VLP16.yaml": (16, 0.002, {0: -15.0, 1: 1.0, 14: -1.0, 15: 15.0}),
-    "vlp32c_ros2/VLP32.yaml": (32, 0.004, {0: -25.0, 3: -15.639, 29: 15.0, 31: -1.333}),
-    "calibration-without-recording/HDL32.yaml": (32, 0.002, {0: -30.67, 1: -9.33, 31: 10.67}),
-    "calibration-without-recording/VLP16_hires.yaml": (16, 0.002, {0: -10.0, 1: 0.667, 15: 10.0}),
-    "calibration-without-recording/HDL64e_s2.yaml": (64, 0.002, {}),
-    "calibration-without-recording/HDL64e_s3.yaml": (64, 0.002, {}),
+    "vlp16_ros2_dual/VLP16.yaml": ("VLP-16", 0.002, {0: -15.0, 1: 1.0, 14: -1.0, 15: 15.0}),
+    "vlp32c_ros2/VLP32.yaml": ("VLP-32C", 0.004, {0: -25.0, 3: -15.639, 29: 15.0, 31: -1.333}),
+    f"{ALONE}/HDL32.yaml": ("HDL-32E", 0.002, {0: -30.67, 1: -9.33, 31: 10.67}),
+    f"{ALONE}/VLP16_hires.yaml": ("Puck Hi-Res", 0.002, {0: -10.0, 1: 0.667, 15: 10.0}),
+    f"{ALONE}/HDL64e_s2.yaml": ("HDL-64E S3", 0.002, {}),
+    f"{ALONE}/HDL64e_s3.yaml": ("HDL-64E S3", 0.002, {}),
 }
 
 
@@ -36,9 +39,12 @@ def real(name: str) -> VelodyneFile:
 
 @pytest.mark.parametrize("name", VELODYNE)
 def test_real_files(name: str) -> None:
-    lasers, unit_m, elevation_deg = VELODYNE[name]
+    model, unit_m, elevation_deg = VELODYNE[name]
+    calibration = read_calibration(VELODYNE_FOLDER / name)
+    assert calibration is not None
+    assert calibration.model == model
     file = real(name)
-    assert (file.lasers, file.unit_m, file.notes) == (lasers, unit_m, ())
+    assert (file.lasers, file.unit_m, file.notes) == (len(MODELS[model].elevation_deg), unit_m, ())
     assert file.enabled.all()
     for laser, angle_deg in elevation_deg.items():
         assert math.degrees(file.elevation_rad[laser]) == pytest.approx(angle_deg, abs=4e-4)

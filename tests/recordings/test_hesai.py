@@ -20,7 +20,6 @@ from tests.recordings.references import (
     WEAK_FIRST,
     WEAK_LAST,
     Made,
-    assert_same_points,
     converted,
     heading_deg,
     turned_deg,
@@ -177,14 +176,6 @@ def test_the_rotor_goes_on_while_beams_fire(case: Case, tmp_path: Path) -> None:
     lag_ns = 5632 if case.model.startswith("PandarXT") else 0
     # 600 rpm, but for the motor's ripple.
     assert np.abs(moved_deg - (case.offset_ns[on.ring] + lag_ns) * 3600e-9).max() < 0.002
-
-
-@every_case
-def test_points_do_not_depend_on_the_windows(case: Case, tmp_path: Path) -> None:
-    whole = converted(case.bag, tmp_path / "whole", *AS_PUBLISHED).cloud
-    for number, words in enumerate((("--rate", "29.97"), ("--rate", "5", "--slices", "7"))):
-        again = converted(case.bag, tmp_path / str(number), *AS_PUBLISHED, *words).cloud
-        assert_same_points(again, whole)
 
 
 def test_the_published_sweep_of_the_xt16_starts_when_the_manual_states(tmp_path: Path) -> None:

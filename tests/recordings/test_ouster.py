@@ -11,75 +11,18 @@ import pytest
 
 from mlbatch.arrays import BoolArray, F32Array, I64Array
 from tests.builders.run import Cloud, command
-from tests.recordings import RECORDINGS
+from tests.recordings.ouster import CASES, OUSTER, PAIRS, SINGLES, Case, twins
 
-FOLDER = RECORDINGS / "ouster"
 TOLERANCE_M = 1e-4
 
 
-@dataclass(frozen=True, slots=True)
-class Case:
-    """A recording, its metadata and the decoder's output; `only` is a serial number."""
-
-    name: str
-    pcap: str
-    metadata: tuple[str, ...]
-    reference: str = "reference.npz"
-    only: str = ""
-
-    def options(self) -> list[str | Path]:
-        """What comes before the options of a test."""
-        folder = FOLDER / self.name
-        words: list[str | Path] = ["convert", folder / self.pcap]
-        for name in self.metadata:
-            words += ["--metadata", folder / name]
-        return words + (["--only", self.only] if self.only else [])
-
-
-def single(name: str, pcap: str, metadata: str) -> Case:
-    """A case of one sensor."""
-    return Case(name, pcap, (metadata,))
-
-
-def twins(kind: str) -> tuple[Case, Case]:
-    """The sensors of a recording of two: OS-0-128 (json .1), OS-1-64-AH (json .2)."""
-    name, stem = f"two-sensors_same-ports_{kind}", f"same_ports_{kind}"
-    metadata = (f"{stem}.1.json", f"{stem}.2.json")
-    return (
-        Case(name, f"{stem}.pcap", metadata, "reference.1.npz", "122247000785"),
-        Case(name, f"{stem}.pcap", metadata, "reference.2.npz", "122239000672"),
-    )
-
-
-OS0_32 = "OS-0-32-U1_v2.2.0_1024x10"
-SINGLES = (
-    single(
-        "os0-128_v2.3.0_rng15",
-        "OS-0-128-U1_v2.3.0_1024x10.pcap",
-        "OS-0-128-U1_v2.3.0_1024x10.json",
-    ),
-    single("os0-32_v2.2.0_rng19-dual", f"{OS0_32}.pcap", f"{OS0_32}.json"),
-    single("os0-32_v2.2.0_single-packet", f"{OS0_32}-single-packet.pcap", f"{OS0_32}.json"),
-    single(
-        "os1-128_v2.3.0_rng15_3frames",
-        "OS-1-128_v2.3.0_1024x10_lb_n3.pcap",
-        "OS-1-128_v2.3.0_1024x10.json",
-    ),
-    single(
-        "os1-32-g_v2.1.1_legacy", "OS-1-32-G_v2.1.1_1024x10.pcap", "OS-1-32-G_v2.1.1_1024x10.json"
-    ),
-    single(
-        "os1-64_fw2.0_legacy_reduced-config",
-        "OS-1-64_1024x10_fw20.pcap",
-        "OS-1-64_sensor_config_reduced.json",
-    ),
-    single("os1-64_fw1_legacy_broadcast", "ouster_example.pcap", "ouster_example.json"),
-    single("os0-128_512x10_crc", "crc_test.pcap", "crc_test.json"),
-    single("os2-128_duplicate-ip-id", "duplicate_id.pcap", "duplicate_id.json"),
-    single("os0-128_windowed", "windowed_frame1.pcap", "windowed_frame1_0.json"),
-)
-PAIRS = (twins("legacy"), twins("nonlegacy"))
-ALONE = (*SINGLES, *(case for pair in PAIRS for case in pair))
+def convert(*cases: Case) -> list[str | Path]:
+    """The begin of a command on one sensor, or on both of a pair."""
+    files = twins(cases[0].folder.rpartition("_")[2]) if cases[0].only else cases
+    words: list[str | Path] = ["convert", cases[0].path]
+    for case in files:
+        words += ["--metadata", case.metadata_path]
+    return words + (["--only", cases[0].only] if cases[0].only and len(cases) == 1 else [])
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,7 +40,7 @@ class Reference:
     @classmethod
     def of(cls, case: Case) -> Reference:
         """Pixels with a range, in columns that the sensor calls valid."""
-        with np.load(FOLDER / case.name / case.reference) as npz:
+        with np.load(OUSTER / case.folder / case.reference) as npz:
             valid: BoolArray = npz["valid"]
             stamp_ns = npz["timestamp_ns"].astype(np.int64)
             range_mm = npz["range_mm"].astype(np.int64)
@@ -116,11 +59,6 @@ class Reference:
             )
 
 
-def name_of(case: Case) -> str:
-    """Name of a case in the list of tests."""
-    return f"{case.name}-{case.only}" if case.only else case.name
-
-
 def compare(found: Cloud, expected: Reference, *, ring_base: int = 0) -> None:
     """Every pixel, in order, and nothing else; stamps aside."""
     assert len(found.range_m) == len(expected.range_mm)
@@ -135,9 +73,9 @@ def compare(found: Cloud, expected: Reference, *, ring_base: int = 0) -> None:
     assert error_m.max() <= TOLERANCE_M
 
 
-@pytest.mark.parametrize("case", ALONE, ids=name_of)
+@pytest.mark.parametrize("case", CASES, ids=str)
 def test_every_pixel_of_a_sensor_alone(case: Case, tmp_path: Path) -> None:
-    result = command(*case.options(), "-o", tmp_path / "scans", "--keep-partial")
+    result = command(*convert(case), "-o", tmp_path / "scans", "--keep-partial")
     assert result.code == 0, result.err
     found, expected = Cloud.of_all(tmp_path / "scans"), Reference.of(case)
     assert np.array_equal(found.column_stamp_ns, expected.column_stamp_ns)
@@ -146,10 +84,10 @@ def test_every_pixel_of_a_sensor_alone(case: Case, tmp_path: Path) -> None:
     compare(found, expected)
 
 
-@pytest.mark.parametrize("case", SINGLES, ids=name_of)
+@pytest.mark.parametrize("case", SINGLES, ids=str)
 def test_metadata_next_to_the_recording_is_found(case: Case, tmp_path: Path) -> None:
-    explicit = command(*case.options(), "--dry-run", "--keep-partial", "--quiet")
-    found = command("convert", FOLDER / case.name / case.pcap, "--dry-run", "--keep-partial")
+    explicit = command(*convert(case), "--dry-run", "--keep-partial", "--quiet")
+    found = command("convert", case.path, "--dry-run", "--keep-partial")
     assert found.code == 0, found.err
     assert _without_timing(found.out) == _without_timing(explicit.out)
 
@@ -160,12 +98,11 @@ def _without_timing(text: str) -> dict[str, object]:
     return report
 
 
-@pytest.mark.parametrize("pair", PAIRS, ids=lambda pair: pair[0].name)
+@pytest.mark.parametrize("pair", PAIRS, ids=lambda pair: pair[0].folder)
 def test_clocks_thousands_of_seconds_apart_are_an_error(
     pair: tuple[Case, Case], tmp_path: Path
 ) -> None:
-    both = Case(pair[0].name, pair[0].pcap, pair[0].metadata)
-    result = command(*both.options(), "-o", tmp_path / "scans", "--identity-extrinsics")
+    result = command(*convert(*pair), "-o", tmp_path / "scans", "--identity-extrinsics")
     assert result.code == 1
     assert result.err.count("\n") == 1, result.err
     assert "--clock host" in result.err
@@ -178,7 +115,7 @@ def test_clocks_thousands_of_seconds_apart_are_an_error(
 
 def _offset_s(case: Case) -> float:
     """Newest stamp minus receive time of the fastest packet, as the decoder's output has them."""
-    with np.load(FOLDER / case.name / case.reference) as npz:
+    with np.load(OUSTER / case.folder / case.reference) as npz:
         receive_ns = npz["packet_timestamp_ns"].astype(np.int64)
         stamp_ns = np.where(npz["valid"], npz["timestamp_ns"].astype(np.int64), 0)
     newest_ns = stamp_ns.reshape(*receive_ns.shape, -1).max(axis=-1)
@@ -186,11 +123,10 @@ def _offset_s(case: Case) -> float:
     return float((newest_ns - receive_ns)[known].max()) / 1e9
 
 
-@pytest.mark.parametrize("pair", PAIRS, ids=lambda pair: pair[0].name)
+@pytest.mark.parametrize("pair", PAIRS, ids=lambda pair: pair[0].folder)
 def test_two_sensors_by_receive_time(pair: tuple[Case, Case], tmp_path: Path) -> None:
-    both = Case(pair[0].name, pair[0].pcap, pair[0].metadata)
     result = command(
-        *both.options(),
+        *convert(*pair),
         *("-o", tmp_path / "scans", "--keep-partial", "--clock", "host", "--identity-extrinsics"),
     )
     assert result.code == 0, result.err
@@ -208,7 +144,7 @@ def test_two_sensors_by_receive_time(pair: tuple[Case, Case], tmp_path: Path) ->
 
 
 def _channels(case: Case) -> int:
-    with np.load(FOLDER / case.name / case.reference) as npz:
+    with np.load(OUSTER / case.folder / case.reference) as npz:
         return int(npz["range_mm"].shape[1])
 
 
@@ -220,15 +156,10 @@ def _channels(case: Case) -> int:
     ],
 )
 def test_recordings_without_lidar_data_say_so(path: str, words: list[str], tmp_path: Path) -> None:
-    result = command("convert", FOLDER / path, "-o", tmp_path / "scans", "--keep-partial")
+    result = command("convert", OUSTER / path, "-o", tmp_path / "scans", "--keep-partial")
     assert result.code == 1
     assert result.out == ""
     assert result.err.count("\n") == 1, result.err
     for word in ("no lidar packets", "expected", "found", path.split("/")[-1], *words):
         assert word in result.err
     assert not list(tmp_path.iterdir())
-
-
-def test_every_case_is_tested() -> None:
-    tested = {case.name for case in ALONE} | {"empty-pcap", "os0-128_imu-zone-no-lidar"}
-    assert {path.name for path in FOLDER.iterdir() if path.is_dir()} == tested

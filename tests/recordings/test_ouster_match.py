@@ -14,6 +14,7 @@ from mlbatch.types import Stream
 from tests.builders.streams import beside
 from tests.recordings.ouster import (
     CASES,
+    ONLY_IMU,
     OUSTER,
     Case,
     datagrams,
@@ -22,7 +23,7 @@ from tests.recordings.ouster import (
 
 
 def test_real_packets_equal_the_reference() -> None:
-    case = Case("os0-128_imu-zone-no-lidar", "imu_zm_no_lidar.pcap", "imu_zm_no_lidar_0.json")
+    case = ONLY_IMU
     reference = case.arrays()
     calibration = read_calibration(case.metadata_path)
     assert calibration is not None
@@ -104,7 +105,7 @@ def test_no_metadata_take_packets_of_another_unit() -> None:
     for case in CASES:
         own = calibration_at(case.metadata_path)
         size = own.metadata.layout.packet_size
-        found = evidence(OUSTER / case.folder / case.capture, size, case.source)
+        found = evidence(case.path, size, case.source)
         for other in calibrations:
             # Without serial numbers any unit with packets of this size may be the one.
             might = own.serial in ("", other.serial) or own.metadata.layout.legacy
@@ -112,7 +113,7 @@ def test_no_metadata_take_packets_of_another_unit() -> None:
             assert (other.match_score(found) > 0) == same, (case, other.path)
 
 
-@pytest.mark.parametrize("case", CASES, ids=lambda case: case.folder + case.source)
+@pytest.mark.parametrize("case", CASES, ids=str)
 def test_real_packets_are_named(case: Case) -> None:
     calibration = calibration_at(case.metadata_path)
     layout = calibration.metadata.layout
@@ -130,7 +131,7 @@ def test_real_packets_are_named(case: Case) -> None:
 
 
 def test_real_imu_and_zone_packets_are_named() -> None:
-    case = Case("os0-128_imu-zone-no-lidar", "imu_zm_no_lidar.pcap", "imu_zm_no_lidar_0.json")
+    case = ONLY_IMU
     serial = "serial 122247000785"
     assert describe(452, case.payloads(452)) == f"Ouster IMU, {serial}, 452 bytes"
     assert describe(680, case.payloads(680)) == f"Ouster zone monitor, {serial}, 680 bytes"

@@ -14,7 +14,7 @@ from mlbatch.sensors import read_calibration
 from mlbatch.sensors.crc import crc64
 from mlbatch.sensors.ouster.sensor import OusterCalibration, OusterLidar
 from mlbatch.types import Stream
-from tests.recordings.ouster import CASES, OUSTER, Case, Reference
+from tests.recordings.ouster import CASES, ONLY_IMU, OUSTER, Case, Reference
 
 MAX_TABLE_ERROR_M = 1e-9
 
@@ -32,7 +32,7 @@ def loaded(case: Case) -> tuple[OusterCalibration, OusterLidar, U8Array, Referen
     return calibration, lidar, case.payloads(lidar.packet_size), case.arrays()
 
 
-@pytest.mark.parametrize("case", CASES, ids=lambda case: case.folder + case.source)
+@pytest.mark.parametrize("case", CASES, ids=str)
 class TestEveryRecording:
     def test_the_table_equals_the_formula(self, case: Case) -> None:
         _, lidar, _, reference = loaded(case)
@@ -121,7 +121,7 @@ def test_checksums_of_recent_firmware(folder: str, count: int) -> None:
 
 
 def test_checksum_of_an_imu_and_a_zone_packet() -> None:
-    case = Case("os0-128_imu-zone-no-lidar", "imu_zm_no_lidar.pcap", "imu_zm_no_lidar_0.json")
+    case = ONLY_IMU
     for size, count in ((452, 8), (680, 1)):
         packets = case.payloads(size)
         result = np.ascontiguousarray(packets[:, -8:]).view("<u8")[:, 0]

@@ -21,7 +21,6 @@ from tests.recordings.references import (
     HOUR_NS,
     US_NS,
     apart,
-    assert_same_points,
     converted,
     heading_deg,
     turned_deg,
@@ -146,13 +145,6 @@ def test_time_of_the_first_packet_by_hand(tmp_path: Path) -> None:
     assert made.cloud.column_stamp_ns[0] == hour_s * 1_000_000_000 + past_hour_us * US_NS
     assert made.cloud.column_stamp_ns[0] == 1_453_364_282_340_595_000
     assert made.report["timescale"] == made.sensor["clock"]["epoch"] == "utc"
-
-
-@every_case
-def test_points_do_not_depend_on_the_windows(case: Case, tmp_path: Path) -> None:
-    whole = converted(case.path, tmp_path / "whole").cloud
-    for number, words in enumerate((("--rate", "29.97"), ("--rate", "5", "--slices", "7"))):
-        assert_same_points(converted(case.path, tmp_path / str(number), *words).cloud, whole)
 
 
 def test_an_azimuth_of_36000_costs_no_packet(tmp_path: Path) -> None:

@@ -97,19 +97,3 @@ def test_files_of_the_vendors_angles_change_nothing() -> None:
         assert note.startswith(f"{path}: the vertical offsets of all lasers are 0; those of a ")
         assert (lidar.channel == table.channel).all()
         assert lidar.calibration == str(path)
-
-
-@pytest.mark.parametrize(
-    ("file", "model"),
-    [
-        ("HDL32.yaml", "HDL-32E"),
-        ("HDL64e_s2.yaml", "HDL-64E S3"),
-        ("HDL64e_s3.yaml", "HDL-64E S3"),
-        ("VLP16_hires.yaml", "Puck Hi-Res"),
-    ],
-)
-def test_which_model_a_file_is_of(file: str, model: str) -> None:
-    path = FOLDER / "calibration-without-recording" / file
-    read = velodyne.read_calibration(path, path.read_bytes())
-    assert read is not None
-    assert read.model == model
