@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import re
 import runpy
+import shutil
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -295,9 +296,8 @@ def test_recordings_are_neither_denied_nor_kept_secret() -> None:
 
 
 def test_the_example_of_a_writer_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Saved in a folder of formats, as the page says, it is found and writes every point."""
-    (example,) = re.findall(r"^```python\n(.*?)^```$", _page("extend.md"), re.M | re.S)
-    (tmp_path / "rawf32.py").write_text(example, encoding="utf-8")
+    """Saved in a folder of formats, as extend.md says, it is found and writes every point."""
+    shutil.copy(ROOT / "examples" / "mlbatch-example" / "mlbatch_example" / "rawf32.py", tmp_path)
     monkeypatch.setattr(formats, "__path__", [*formats.__path__, str(tmp_path)])
     writers.format_names.cache_clear()
     try:

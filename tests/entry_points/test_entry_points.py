@@ -150,10 +150,9 @@ def test_the_example_is_listed(site: Path, tmp_path: Path) -> None:
     assert "rawf32" in done.stderr
 
 
-def test_the_page_shows_or_names_the_modules_of_the_example() -> None:
+def test_the_page_names_the_modules_of_the_example() -> None:
     page = (ROOT / "docs" / "extend.md").read_text(encoding="utf-8")
-    assert (EXAMPLE / "mlbatch_example" / "rawf32.py").read_text(encoding="utf-8") in page
-    for module in ("framelog", "sensor"):
+    for module in ("framelog", "sensor", "rawf32"):
         assert (EXAMPLE / "mlbatch_example" / f"{module}.py").is_file()
         assert f"`mlbatch_example/{module}.py`" in page
 
