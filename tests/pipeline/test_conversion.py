@@ -14,7 +14,7 @@ import pytest
 
 import mlbatch
 from mlbatch.discovery.discover import SensorSelection
-from mlbatch.errors import ClockError, ExportError, RecordingError, UsageError
+from mlbatch.errors import ClockError, ExportError, RecordingError
 from mlbatch.pipeline.conversion import Conversion
 from mlbatch.pipeline.job import Job, wait_ns
 from mlbatch.pipeline.passthrough import ImuQueue
@@ -212,41 +212,10 @@ def test_a_writer_is_opened_with_the_first_scan_only(tmp_path: Path) -> None:
 # -- scans in Python ------------------------------------------------------------------------------
 
 
-def test_scans_in_python_are_those_of_the_command_line() -> None:
-    expected = [scan for scan in in_memory(FIXTURE).scans if 0 <= scan.index < 7]
-    found = list(mlbatch.scans(CAPTURE, rig=RIG, rate=10))
-    assert [scan.index for scan in found] == list(range(7))
-    for mine, theirs in zip(found, expected, strict=True):
-        np.testing.assert_array_equal(mine.xyz, theirs.xyz)
-        np.testing.assert_array_equal(mine.ring, theirs.ring)
-        assert mine.info.sensors[0].name == "left"
-
-
 def test_scans_in_python_may_be_kept() -> None:
     found = list(mlbatch.scans(str(CAPTURE), rig=str(RIG)))
     assert not np.shares_memory(found[0].xyz, found[1].xyz)
     assert len({scan.xyz[:100].tobytes() for scan in found}) > 1
-
-
-def test_scans_in_python_refuse_what_the_command_line_refuses() -> None:
-    with pytest.raises(UsageError, match="clock: expected sensor or host, found 'gps'"):
-        next(iter(mlbatch.scans(CAPTURE, clock="gps")))
-    with pytest.raises(RecordingError, match=r"none\.pcap: expected a recording, found no such"):
-        next(iter(mlbatch.scans("none.pcap")))
-    for seconds in (math.nan, 0.0, -1.0, -math.inf):
-        with pytest.raises(UsageError, match="max_wait: expected seconds above 0, or inf, found "):
-            next(iter(mlbatch.scans(CAPTURE, max_wait=seconds)))
-    for low_m, high_m in ((-1.0, 2.0), (math.nan, 2.0), (3.0, 2.0), (3.0, math.nan)):
-        with pytest.raises(UsageError, match=r"m(in|ax)_range: expected "):
-            next(iter(mlbatch.scans(CAPTURE, min_range=low_m, max_range=high_m)))
-
-
-@pytest.mark.parametrize("slices", [0, 2.5, 2.0, 10_001, "2", None])
-def test_scans_in_python_have_whole_numbers_of_slices(slices: object) -> None:
-    with pytest.raises(
-        UsageError, match=r"slices: expected a whole number from 1 to 10000, found "
-    ):
-        next(iter(mlbatch.scans(CAPTURE, slices=slices)))  # type: ignore[arg-type]
 
 
 def test_scans_in_python_take_numbers_of_numpy() -> None:

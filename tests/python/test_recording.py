@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import math
-import subprocess
-import sys
 from itertools import islice
 from pathlib import Path
+from typing import Any
 
 import dpkt
 import numpy as np
@@ -15,6 +14,7 @@ import pytest
 import mlbatch
 from mlbatch.errors import RecordingError, RigError, UsageError
 from mlbatch.python.recording import Recording
+from tests.builders.run import command
 from tests.builders.sessions import Unit, twin, write_session
 from tests.contract.tree import ROOT, run_python
 
@@ -110,24 +110,55 @@ def test_one_name_of_a_sensor() -> None:
 # -- scans ----------------------------------------------------------------------------------------
 
 
-def test_scans_are_those_of_the_command_line(rec: Recording, tmp_path: Path) -> None:
-    command = [
-        sys.executable,
-        "-m",
-        "mlbatch",
-        "convert",
-        str(CAPTURE),
-        "--rig",
-        str(RIG),
-        "--rate",
-        "20",
+# 08:00 UTC of the recording, a drive at 10 m/s along x.
+TUM = "".join(
+    f"{1_777_881_600 + hundredth // 100}.{hundredth % 100:02} {hundredth / 10} 0 0 0 0 0 1\n"
+    for hundredth in range(-100, 300)
+)
+AS_BY_COMMAND: list[dict[str, Any]] = [
+    {"rate": 20},
+    {"deskew": "drive.tum", "deskew_to": "end"},
+    {"batching": "latest", "batching_times": "own"},
+]
+
+
+def _command(output: str, options: dict[str, Any]) -> None:
+    """Convert by the command."""
+    words = [
+        word
+        for name, value in options.items()
+        for word in (f"--{name.replace('_', '-')}", str(value))
     ]
-    subprocess.run([*command, "-o", str(tmp_path / "scans"), "--quiet"], check=True)
-    files = sorted((tmp_path / "scans").glob("*.npz"))
-    for file, scan in zip(files, rec.scans(20), strict=True):
+    done = command("convert", CAPTURE, "--rig", RIG, "--quiet", "-o", output, *words)
+    assert done.code == 0, done.err
+
+
+@pytest.mark.parametrize("options", AS_BY_COMMAND)
+def test_scans_are_those_of_the_command(
+    rec: Recording, options: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("drive.tum").write_text(TUM, encoding="utf-8")
+    _command("scans", options)
+    files = sorted(Path("scans").glob("*.npz"))
+    for file, scan in zip(files, rec.scans(**options), strict=True):
         with np.load(file) as stored:
-            for key in set(stored.files) - {"schema"}:
+            for key in set(stored.files) - {"schema", *options}:
                 np.testing.assert_array_equal(getattr(scan, key), stored[key], err_msg=key)
+
+
+@pytest.mark.parametrize("options", [*AS_BY_COMMAND, {"stamp": "middle"}])
+def test_outputs_are_those_of_the_command(
+    rec: Recording, options: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("drive.tum").write_text(TUM, encoding="utf-8")
+    _command("command.mcap", options)
+    run = mlbatch.convert(rec, "python.mcap", **options)
+    assert run.path == Path("python.mcap")
+    assert Path("python.mcap").read_bytes() == Path("command.mcap").read_bytes()
+    names = [path.name for path in sorted(tmp_path.glob("python*"))]
+    assert names == ["python.mcap", "python.mcap.report.json", "python.mcap.scans.csv"]
 
 
 def test_each_pass_is_of_its_own(rec: Recording) -> None:
@@ -290,11 +321,31 @@ def test_packets_of_no_sensor(rec: Recording) -> None:
         ({"max_wait": None}, "max_wait: expected seconds above 0, or inf, found None"),
         ({"exclude_boxes": [("a", "b")]}, "exclude_boxes: expected"),
         ({"start": "+2", "end": "+1"}, "end: expected a time after start"),
+        ({"deskew": "constant-velocity", "start": "+1"}, "expected the recording from its begin"),
+        ({"deskew": "missing.tum"}, "--deskew: expected imu, constant-velocity or the file"),
+        ({"deskew_to": "end"}, "--deskew-to: expected --deskew, which moves points"),
+        ({"deskew": "imu", "deskew_to": "later"}, "deskew_to: expected start or middle or end"),
+        ({"batching": "newest"}, "batching: expected window, latest, approximate, collate"),
+        ({"batching_times": "own"}, "batching-times: expected common for windows, found own"),
+        *(
+            ({"max_wait": seconds}, "max_wait: expected seconds above 0, or inf, found ")
+            for seconds in (math.nan, 0.0, -1.0, -math.inf)
+        ),
+        *(
+            ({"min_range": low_m, "max_range": high_m}, r"m(in|ax)_range: expected ")
+            for low_m, high_m in ((-1.0, 2.0), (math.nan, 2.0), (3.0, 2.0), (3.0, math.nan))
+        ),
+        *(
+            ({"slices": slices}, "slices: expected a whole number from 1 to 10000, found ")
+            for slices in (0, 2.5, 2.0, 10_001, "2", None)
+        ),
     ],
 )
 def test_impossible_values(options: dict[str, object], expected: str, rec: Recording) -> None:
     with pytest.raises(UsageError, match=expected):
         rec.scans(**options)  # type: ignore[arg-type]
+    with pytest.raises(UsageError, match=expected):
+        mlbatch.scans(CAPTURE, rig=RIG, **options)  # type: ignore[arg-type]
 
 
 def test_a_path_of_another_type() -> None:
@@ -318,6 +369,8 @@ def test_a_missing_recording_is_named_at_the_call() -> None:
         mlbatch.scans("none.pcap")
     with pytest.raises(UsageError, match="layout: expected dense or organized"):
         mlbatch.scans("none.pcap", layout="sparse")
+    with pytest.raises(UsageError, match="clock: expected sensor or host, found 'gps'"):
+        mlbatch.scans(CAPTURE, clock="gps")
 
 
 def test_the_part_of_a_sensor_names_that_alone(rec: Recording) -> None:

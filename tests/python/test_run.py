@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
@@ -17,27 +15,6 @@ from tests.contract.tree import ROOT
 FIXTURE = ROOT / "fixtures" / "two_lidars"
 CAPTURE = FIXTURE / "two_lidars.pcap"
 RIG = FIXTURE / "rig.yaml"
-
-
-def test_the_output_is_that_of_the_command(tmp_path: Path) -> None:
-    command = [
-        sys.executable,
-        "-m",
-        "mlbatch",
-        "convert",
-        str(CAPTURE),
-        "--rig",
-        str(RIG),
-        "--rate",
-        "20",
-    ]
-    subprocess.run([*command, "-o", str(tmp_path / "a.mcap"), "--quiet"], check=True)
-    rec = mlbatch.open(CAPTURE, rig=RIG)
-    run = mlbatch.convert(rec, str(tmp_path / "b.mcap"), rate=20)
-    assert run.path == tmp_path / "b.mcap"
-    assert (tmp_path / "a.mcap").read_bytes() == (tmp_path / "b.mcap").read_bytes()
-    names = [path.name for path in sorted(tmp_path.glob("b*"))]
-    assert names == ["b.mcap", "b.mcap.report.json", "b.mcap.scans.csv"]
 
 
 def test_the_report_of_a_run(tmp_path: Path) -> None:
@@ -101,6 +78,8 @@ def test_options_of_an_opened_recording_are_given_there(tmp_path: Path) -> None:
     rec = mlbatch.open(CAPTURE, rig=RIG)
     with pytest.raises(UsageError, match=r"give it to mlbatch\.open"):
         mlbatch.convert(rec, tmp_path / "scans.mcap", rig=RIG)
+    with pytest.raises(UsageError, match="--stamp: expected start for npz"):
+        mlbatch.convert(rec, tmp_path / "out", stamp="end")
     with pytest.raises(UsageError, match="jobs: expected 1 to 64, or auto, found 0"):
         mlbatch.convert(rec, tmp_path / "scans.mcap", jobs=0)
 
