@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import pty
 import re
 import shutil
 import signal
@@ -119,40 +118,6 @@ def test_sensors_as_table_and_as_json_agree(shell: Shell) -> None:
 
 
 # -- progress, interruption, disks ----------------------------------------------------------------
-
-
-def _run_on_a_terminal(folder: Path, *options: str) -> tuple[int, bytes]:
-    """Exit code of a conversion whose stderr is a terminal, and what came there."""
-    ours, theirs = pty.openpty()
-    command = [sys.executable, "-m", "mlbatch", "convert", str(CAPTURE), "--rig", str(RIG)]
-    with subprocess.Popen(
-        [*command, "-o", "out", *options],
-        cwd=folder,
-        stdout=subprocess.DEVNULL,
-        stderr=theirs,
-        env=os.environ | {"PYTHONPATH": str(REPOSITORY), "TERM": "xterm", "COLUMNS": "80"},
-    ) as process:
-        os.close(theirs)
-        said = b""
-        while True:
-            try:
-                piece = os.read(ours, 65536)
-            except OSError:
-                break
-            if not piece:
-                break
-            said += piece
-    os.close(ours)
-    return process.returncode, said
-
-
-def test_progress_is_shown_on_a_terminal_only(shell: Shell, tmp_path: Path) -> None:
-    code, said = _run_on_a_terminal(tmp_path)
-    assert code == 0
-    assert b"\x1b[" in said
-    assert b"2.5/2.5 MB" in said
-    code, said = _run_on_a_terminal(tmp_path, "--overwrite", "--quiet")
-    assert (code, said) == (0, b"")
 
 
 SLOW = """\

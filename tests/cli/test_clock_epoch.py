@@ -81,13 +81,6 @@ def test_lidars_that_agree_with_each_other_only(shell: Shell, tmp_path: Path) ->
     assert "for every sensor `clock: {offset_s: 5.251}` in the rig" in warning["message"]
 
 
-def test_with_strict_it_is_an_error(shell: Shell, tmp_path: Path) -> None:
-    write_session(tmp_path, _ahead(TAI_S))
-    outcome = shell("convert drive.pcap -o out --strict")
-    assert outcome.code == 1
-    assert "(clock_epoch, an error because of --strict)" in outcome.err
-
-
 @pytest.mark.parametrize(("spec", "codes"), [(SMALL, []), (PTP_SPEC, ["clock_epoch"])])
 def test_a_count_from_power_on_is_a_fault_of_a_time_source_only(
     shell: Shell, tmp_path: Path, spec: OusterSpec, codes: list[str]

@@ -64,15 +64,6 @@ def test_host_clock(shell: Shell, tmp_path: Path) -> None:
     assert json.loads(outcome.out)["policies"][0]["span_ms"]["max"] < 100
 
 
-def test_one_lidar_is_refused(shell: Shell, tmp_path: Path) -> None:
-    outcome = shell(f"compare {write_session(tmp_path / 'in', Unit())}")
-    assert (outcome.code, outcome.out) == (1, "")
-    assert outcome.err == (
-        f"mlbatch: error: {tmp_path / 'in' / 'drive.pcap'}: compare: expected two or more lidars, "
-        "found ouster_111 only; give all recordings of the session\n"
-    )
-
-
 def test_lidars_without_a_common_window_are_refused(shell: Shell, tmp_path: Path) -> None:
     left = Unit(turns=1)
     capture = write_session(tmp_path / "in", left, twin(left, 222))

@@ -49,33 +49,6 @@ FORWARD = 37 * NS_PER_S
 BACK = -20 * NS_PER_S
 
 
-@pytest.mark.parametrize(
-    ("step_ns", "words"),
-    [
-        (
-            FORWARD,
-            "clock jump within the recording: expected stamps of one continuous clock, found a "
-            "step forward from 1800000000.619805 s to 1800000037.622930 s within 0.003125 s at the "
-            "capture host; use --on-jump split, or --clock host",
-        ),
-        (
-            BACK,
-            "clock reset within the recording: expected stamps of one continuous clock, found a "
-            "step back from 1800000000.619805 s to 1799999980.620000 s; use --on-jump split, or "
-            "--clock host",
-        ),
-    ],
-)
-def test_a_jump_is_an_error_that_names_its_times(
-    shell: Shell, tmp_path: Path, step_ns: int, words: str
-) -> None:
-    write_session(tmp_path, *_pieces(Unit(), step_ns))
-    outcome = shell("convert drive.pcap -o out.mcap")
-    assert outcome.code == 1
-    assert outcome.err == f"mlbatch: error: sensor ouster_111: {words}\n"
-    assert not list(tmp_path.glob("out*"))
-
-
 def test_a_gap_is_no_jump(shell: Shell, tmp_path: Path) -> None:
     """Five seconds of silence, at the sensor and at the capture host."""
     first = Unit(turns=6)

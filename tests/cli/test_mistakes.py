@@ -8,13 +8,17 @@ from pathlib import Path
 
 import pytest
 
+from tests.builders.captures import udp_frame
+from tests.builders.others import filled
 from tests.builders.sessions import (
     EPOCH_NS,
     FIXTURE,
     NO_RECORDINGS,
+    NS_PER_MS,
     NS_PER_S,
     RECORDINGS,
     SMALL,
+    Records,
     Shell,
     Unit,
     recording_shell,
@@ -27,6 +31,7 @@ from tests.builders.transcripts import transcripts
 MISTAKES = transcripts("files")
 REAL_MISTAKES = transcripts("recordings")
 URLS = transcripts("urls")
+SESSIONS = transcripts("sessions")
 OPTIONS = transcripts("options", FIX="fix/two_lidars.pcap --rig fix/rig.yaml")
 UPTIME = Unit(begin_ns=1000 * NS_PER_S, host_ns=EPOCH_NS - 1000 * NS_PER_S)
 
@@ -76,6 +81,7 @@ def _write_sessions(folder: Path) -> None:
     one = Unit()
     write_session(folder / "bare", one, metadata=False)
     _write_other_modes(folder)
+    write_timed_sessions(folder)
     write_session(folder / "uptime", UPTIME)
     write_session(folder / "pair", one, twin(one, 222))
     (folder / "other").mkdir()
@@ -94,6 +100,40 @@ def _write_sessions(folder: Path) -> None:
     write_session(folder / "twice", one, more=[one.records[7]])
     whole = write_session(folder / "cut", one)
     whole.write_bytes(whole.read_bytes()[:-338])
+
+
+def m1() -> Records:
+    """Packets of a lidar that has no decoder."""
+    return [
+        (EPOCH_NS + 1_327_000 * n, frame)
+        for n in range(20)
+        for frame in udp_frame(
+            filled(1210, {0: bytes.fromhex("55aa5aa5"), 4: bytes((0, n))}),
+            src="10.0.0.8",
+            dport=6699,
+        )
+    ]
+
+
+def write_timed_sessions(folder: Path) -> None:
+    """A lidar without decoder, and clocks that are on another time, or step."""
+    write_session(folder / "m1", more=m1())
+    write_session(folder / "m1_bare", Unit(), more=m1(), metadata=False)
+    write_session(folder / "m1_pair", Unit(), more=m1())
+    second = Unit(turns=10)
+    write_session(folder / "second", second)
+    since_ns = 866 * NS_PER_S + 20 * NS_PER_MS
+    ahead_ns = EPOCH_NS - 866 * NS_PER_S
+    write_session(folder / "power_on", replace(second, begin_ns=since_ns, host_ns=ahead_ns))
+    for name, step_s in (("forward", 37), ("back", -20)):
+        before = Unit(turns=6)
+        begin_ns = before.begin_ns + 600 * NS_PER_MS + step_s * NS_PER_S
+        host_ns = before.host_ns - step_s * NS_PER_S
+        after = replace(before, begin_ns=begin_ns, host_ns=host_ns, first_frame=11)
+        write_session(folder / name, before, after)
+    six = Unit(turns=6)
+    ahead = replace(six, begin_ns=six.begin_ns + 37 * NS_PER_S, host_ns=six.host_ns - 37 * NS_PER_S)
+    write_session(folder / "tai", ahead)
 
 
 def _write_other_modes(folder: Path) -> None:
@@ -119,6 +159,19 @@ def shell(
 @pytest.mark.parametrize("name", MISTAKES)
 def test_mistake(shell: Shell, place: Path, name: str) -> None:
     MISTAKES[name].check(shell, place)
+
+
+@pytest.mark.parametrize("name", SESSIONS)
+def test_session(
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    place: Path,
+    tmp_path: Path,
+    name: str,
+) -> None:
+    for path in place.iterdir():
+        (tmp_path / path.name).symlink_to(path)
+    SESSIONS[name].check(recording_shell(monkeypatch, capsys, tmp_path), tmp_path)
 
 
 @pytest.mark.parametrize("name", OPTIONS)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import pty
 import re
@@ -112,31 +113,37 @@ def test_both_passes_are_shown(shell: Shell, monkeypatch: pytest.MonkeyPatch) ->
     assert re.search(r"mlbatch: 2/2 convert: 100 %, 2\.5/2\.5 MB, \d scans, 0:00 left\n", said)
 
 
-@pytest.mark.parametrize("command", [*COMMANDS, "verify done.mcap"])
-def test_a_terminal_shows_a_bar(shell: Shell, tmp_path: Path, command: str) -> None:
-    assert shell(f"convert {CAPTURE} --rig {RIG} -o done.mcap").code == 0
+def _on_a_terminal(folder: Path, command: str) -> tuple[int, bytes]:
+    """Exit code of a command whose stderr is a terminal, and what comes there."""
     ours, theirs = pty.openpty()
     with subprocess.Popen(
         [sys.executable, "-m", "mlbatch", *command.split()],
-        cwd=tmp_path,
+        cwd=folder,
         stdout=subprocess.DEVNULL,
         stderr=theirs,
         env=os.environ | {"PYTHONPATH": str(REPOSITORY), "TERM": "xterm", "COLUMNS": "80"},
     ) as process:
         os.close(theirs)
         said = b""
-        while True:
-            try:
-                piece = os.read(ours, 65536)
-            except OSError:
-                break
-            if not piece:
-                break
-            said += piece
+        # The end of a terminal is an error of the device.
+        with contextlib.suppress(OSError):
+            while piece := os.read(ours, 65536):
+                said += piece
     os.close(ours)
-    assert process.returncode == 0
+    return process.returncode, said
+
+
+@pytest.mark.parametrize("command", [*COMMANDS, "verify done.mcap"])
+def test_a_terminal_shows_a_bar(shell: Shell, tmp_path: Path, command: str) -> None:
+    assert shell(f"convert {CAPTURE} --rig {RIG} -o done.mcap").code == 0
+    code, said = _on_a_terminal(tmp_path, command)
+    assert code == 0
     assert command.split()[0].encode() in said
     assert (b"7/7 scans" if command.startswith("verify") else b"2.5/2.5 MB") in said
     assert b"ETA" in said
     # The bar disappears: its line is erased at the end.
     assert said.rstrip().endswith(b"\x1b[2K")
+
+
+def test_quiet_shows_no_bar(tmp_path: Path) -> None:
+    assert _on_a_terminal(tmp_path, f"{COMMANDS[0]} --quiet") == (0, b"")
