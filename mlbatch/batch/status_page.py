@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import os
-from html import escape
-from importlib import resources
 from pathlib import Path
 from urllib.parse import quote
 
-import mlbatch
+from mlbatch.batch.record import DONE, FAILED
 from mlbatch.batch.session import is_url
 from mlbatch.batch.status import (
     HEAD,
@@ -19,79 +17,58 @@ from mlbatch.batch.status import (
     duration_text,
     loss_text,
 )
-from mlbatch.page import MARK, check_page, write_text_page
+from mlbatch.page import check_page, write_text_page
+from mlbatch.page.templates import Verdict, render
 
-_ORDER = {"failed": 0, UNFINISHED: 1, "done": 2}
+# In the order of the page, with the level of each.
+_LEVELS = {FAILED: "problem", UNFINISHED: "warning", DONE: "good"}
+_ORDER = [*_LEVELS]
 # Levels of loss and fill, as in docs/page.md.
 _LOSS_WARNING = 0.001
 _LOSS_PROBLEM = 0.01
 _FILL_WARNING = 0.9
-_BADGES = {"failed": "problem", UNFINISHED: "warning", "done": "good"}
-_STYLE = """
-.good .badge { background: var(--good); }
-td strong.warning { color: var(--warning); }
-td strong.problem { color: var(--problem); }
-"""
 
 
 def write_status_page(path: Path, status: BatchStatus) -> None:
     """Write the page; an earlier page is replaced, any other file never."""
     check_page(path, overwrite=True)
-    write_text_page(path, _page(path, status))
+    sessions = sorted(status.sessions, key=lambda one: (_ORDER.index(one.state), one.name))
+    page = render(
+        "batch.html",
+        title=Path(status.output).name or status.output,
+        verdict=_verdict(status),
+        cards=_cards(status),
+        head=HEAD,
+        rows=[
+            {
+                "cells": dict(zip(HEAD, one.row, strict=True)),
+                "badge": _LEVELS[one.state],
+                "levels": _levels(one),
+                "page": _link(path, status, one.page) if one.page else "",
+            }
+            for one in sessions
+        ],
+    )
+    write_text_page(path, page)
 
 
-def _page(path: Path, status: BatchStatus) -> str:
-    style = resources.files("mlbatch.page").joinpath("page.css").read_text(encoding="utf-8")
-    title = Path(status.output).name or status.output
-    rows = sorted(status.sessions, key=lambda one: (_ORDER[one.state], one.name))
-    body = "\n".join([_header(title, status), _cards(status), _table(path, status, rows)])
-    return f"""{MARK.decode()}
-<html lang="en">
-<head>
-<meta charset="utf-8">
-<meta http-equiv="Content-Security-Policy" content="default-src 'none'; img-src data:; \
-style-src 'unsafe-inline'">
-<meta name="viewport" content="width=device-width, initial-scale=1">
-<meta name="color-scheme" content="light dark">
-<meta name="generator" content="mlbatch {escape(mlbatch.__version__)}">
-<link rel="icon" href="data:,">
-<title>{escape(title)} - mlbatch</title>
-<style>
-{style}{_STYLE}</style>
-</head>
-<body>
-<main>
-{body}
-</main>
-</body>
-</html>
-"""
-
-
-def _header(title: str, status: BatchStatus) -> str:
-    failed = status.count("failed")
-    unfinished = status.count(UNFINISHED)
+def _verdict(status: BatchStatus) -> Verdict:
+    count = len(status.sessions)
+    failed, unfinished = status.count(FAILED), status.count(UNFINISHED)
     cut_off = sum(one.is_cut_off for one in status.sessions)
     level = "problem" if failed else "warning" if unfinished or cut_off else "good"
-    heading = f"{failed} of {len(status.sessions)} sessions failed" if failed else ""
-    if not heading:
-        done = status.count("done")
-        heading = f"{done} of {len(status.sessions)} sessions are done"
+    heading = f"{status.count(DONE)} of {count} sessions are done"
+    if failed:
+        heading = f"{failed} of {count} sessions failed"
     parts = [f"{unfinished} unfinished: running, or interrupted."] * bool(unfinished)
     parts += [f"{cut_off} with a recording that was cut off."] * bool(cut_off)
-    others = " ".join(parts)
-    return (
-        f"<header>\n<h1>{escape(title)}</h1>\n<div class='verdict {level}' id='verdict'>"
-        f"<em>{level}</em><strong>{escape(heading)}</strong><p>{escape(others)}</p></div>\n</header>"
-    )
+    return Verdict(level, level, heading, " ".join(parts))
 
 
-def _cards(status: BatchStatus) -> str:
+def _cards(status: BatchStatus) -> dict[str, str]:
     records = status.records
-    cards = {
-        "done": f"{status.count('done'):,}",
-        "failed": f"{status.count('failed'):,}",
-        "unfinished": f"{status.count(UNFINISHED):,}",
+    return {
+        **{state: f"{status.count(state):,}" for state in (DONE, FAILED, UNFINISHED)},
         "cut off": f"{sum(one.is_cut_off for one in status.sessions):,}",
         "scans": f"{sum(one.scans for one in records):,}",
         "lost packets": loss_text(records),
@@ -100,40 +77,19 @@ def _cards(status: BatchStatus) -> str:
         "recorded": duration_text(sum(one.recorded_s for one in records)),
         "time of all sessions": duration_text(sum(one.wall_s for one in records)),
     }
-    items = "".join(
-        f"<div class='card'><b>{escape(value)}</b><span>{escape(name)}</span></div>"
-        for name, value in cards.items()
-        if value
-    )
-    return f"<div class='cards'>{items}</div>"
 
 
-def _table(path: Path, status: BatchStatus, rows: list[SessionStatus]) -> str:
-    cells = "".join(f"<th>{one}</th>" for one in HEAD)
-    lines = "".join(_row(path, status, one) for one in rows)
-    return (
-        "<section>\n<h2>Sessions</h2>\n<div class='scroll'><table>"
-        f"<tr>{cells}</tr>{lines}</table></div>\n</section>"
-    )
-
-
-def _row(path: Path, status: BatchStatus, one: SessionStatus) -> str:
-    cells = {head: escape(text) for head, text in zip(HEAD, one.row, strict=True)}
-    if one.page:
-        cells["session"] = f"<a href='{_link(path, status, one.page)}'>{cells['session']}</a>"
-    badge = f"<span class='badge'>{one.state}</span>"
-    cells["state"] = f"<span class='{_BADGES[one.state]}'>{badge}</span>"
-    marks = {"lost": "warning" if one.loss >= _LOSS_WARNING else "", "fill": "", "": ""}
-    if one.loss >= _LOSS_PROBLEM:
-        marks["lost"] = "problem"
-    if one.record is not None and one.record.fill is not None and one.record.fill < _FILL_WARNING:
-        marks["fill"] = "warning"
+def _levels(one: SessionStatus) -> dict[str, str]:
+    """Levels of the cells that are marked."""
+    fill = 1.0 if one.record is None or one.record.fill is None else one.record.fill
+    levels = dict.fromkeys(HEAD, "")
+    if one.loss >= _LOSS_WARNING:
+        levels["lost"] = "problem" if one.loss >= _LOSS_PROBLEM else "warning"
+    if fill < _FILL_WARNING:
+        levels["fill"] = "warning"
     if one.is_cut_off:
-        marks[""] = "problem"
-    for head, level in marks.items():
-        if level:
-            cells[head] = f"<strong class='{level}'>{cells[head]}</strong>"
-    return "<tr>" + "".join(f"<td>{cell}</td>" for cell in cells.values()) + "</tr>"
+        levels[""] = "problem"
+    return levels
 
 
 def _link(path: Path, status: BatchStatus, page: str) -> str:
@@ -141,4 +97,4 @@ def _link(path: Path, status: BatchStatus, page: str) -> str:
     if not is_url(status.output):
         target = Path(status.output) / page
         page = os.path.relpath(target.resolve(), path.resolve().parent)
-    return escape(quote(os.fsencode(page)), quote=True)
+    return quote(os.fsencode(page))

@@ -59,7 +59,7 @@ NEEDLESS = (
     *("mlbatch.pipeline.deskew", "mlbatch.motion.se3", "mlbatch.pipeline.merge"),
     *("mlbatch.batching.fusion", "mlbatch.batching.sweeps", "mlbatch.pipeline.shards"),
     *("numpy.ma", "rosbags", "rich", "mcap.writer", "importlib.metadata"),
-    *("mlbatch.readers.capture.odd", "dpkt"),
+    *("mlbatch.readers.capture.odd", "dpkt", "mlbatch.page.templates", "jinja2"),
     *("mlbatch.sensors.advice", "mlbatch.pipeline.segments", "mlbatch.pipeline.time_limits"),
     *("mlbatch.report.limits", "mlbatch.pipeline.overlap", "mlbatch.discovery.overlap"),
 )
