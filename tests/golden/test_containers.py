@@ -5,11 +5,13 @@ from __future__ import annotations
 import gzip
 import re
 from collections import Counter
+from collections.abc import Callable
 from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
 
 import pytest
+import zstandard
 
 from mlbatch.discovery.discover import SensorSelection
 from mlbatch.frames.naming import NAMINGS
@@ -17,10 +19,18 @@ from mlbatch.pipeline.job import Job
 from mlbatch.readers import open_recording
 from mlbatch.readers.bag.packet_messages import PACKET_TYPES
 from mlbatch.types import StreamTable
-from tests.builders.captures import Packet, Section, pcap_bytes, write_pcapng
+from tests.builders.captures import (
+    SLL2,
+    Interface,
+    Packet,
+    Section,
+    pcap_bytes,
+    section_bytes,
+    write_pcapng,
+)
 from tests.builders.run import FIXTURE, RECORDINGS, ROOT, Values, command, in_memory, prints
 from tests.builders.sessions_of_bags import CONTAINERS, edited_copy
-from tests.builders.traffic import read_pcap
+from tests.builders.traffic import datagrams_of, read_pcap
 from tests.matrix.cells import plain
 from tests.matrix.containers import CONTAINERS as MATRIX
 from tests.matrix.lidars import write_metadata
@@ -48,11 +58,37 @@ def of_the_pcap() -> list[Values]:
     return prints(in_memory(FIXTURE))
 
 
-@pytest.mark.parametrize("name", CONTAINERS)
+def _pcapng(tsresol: int, *, big_endian: bool = False) -> bytes:
+    """Stamps in units of 10 to the power of minus `tsresol` s."""
+    unit_ns = 10 ** (9 - tsresol)
+    blocks = [Packet(frame, host_ns // unit_ns) for host_ns, frame in FRAMES]
+    return section_bytes(Section(blocks, [Interface(tsresol=tsresol)], big_endian))
+
+
+FRAMES = read_pcap(FIXTURE.recordings[0])
+CAPTURES: dict[str, Callable[[], bytes]] = {
+    "pcap ns": lambda: pcap_bytes(FRAMES),
+    "pcap us big endian": lambda: pcap_bytes(FRAMES, ns=False, big_endian=True),
+    "pcap ns big endian": lambda: pcap_bytes(FRAMES, big_endian=True),
+    "pcapng us big endian": lambda: _pcapng(6, big_endian=True),
+    "gzip": lambda: gzip.compress(pcap_bytes(FRAMES), 1),
+    "zstd": lambda: zstandard.compress(_pcapng(9)),
+    "unfragmented": lambda: pcap_bytes([one.frame() for one in datagrams_of(FRAMES)]),
+    "cooked link": lambda: pcap_bytes(
+        [one.frame(SLL2) for one in datagrams_of(FRAMES)], linktype=SLL2
+    ),
+}
+
+
+@pytest.mark.parametrize("name", [*CONTAINERS, *CAPTURES])
 def test_scans_do_not_depend_on_the_container(
     name: str, of_the_pcap: list[Values], tmp_path: Path
 ) -> None:
-    path = CONTAINERS[name](tmp_path)
+    if name in CONTAINERS:
+        path = CONTAINERS[name](tmp_path)
+    else:
+        path = tmp_path / "recording"
+        path.write_bytes(CAPTURES[name]())
     assert prints(in_memory(replace(FIXTURE, recordings=(path,)))) == of_the_pcap
 
 

@@ -1,22 +1,20 @@
 """Laws of whole conversions: scans depend only on the packets (docs/batching.md).
 
-Any order of arrival: test_permutations.py; bags: tests/golden and tests/matrix.
+Any order of arrival: test_permutations.py; containers: tests/golden and tests/matrix.
 """
 
 from __future__ import annotations
 
-import gzip
 import warnings
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import pytest
-import zstandard
 from mcap.reader import make_reader
 
 from mlbatch.pipeline.job import Job
-from tests.builders.captures import SLL2, Interface, Packet, Section, pcap_bytes, section_bytes
+from tests.builders.captures import pcap_bytes
 from tests.builders.make_fixtures import START_NS
 from tests.builders.run import BY_HOST, FIXTURE, Values, buffers_of, in_memory, prints, to_file
 from tests.builders.traffic import Records, datagrams, frames, source
@@ -75,44 +73,6 @@ def wanted(tmp_path_factory: pytest.TempPathFactory) -> Wanted:
         messages(job, folder / "all.mcap"),
         messages(replace(job, keep_partial=False), folder / "whole.mcap"),
     )
-
-
-# -- containers -----------------------------------------------------------------------------------
-
-
-def pcapng(
-    records: Iterable[tuple[int, bytes]], *, tsresol: int, big_endian: bool = False
-) -> bytes:
-    """A pcapng file with stamps in units of 10 to the power of minus `tsresol` s."""
-    unit_ns = 10 ** (9 - tsresol)
-    section = Section(
-        [Packet(frame, host_ns // unit_ns) for host_ns, frame in records],
-        [Interface(tsresol=tsresol)],
-        big_endian,
-    )
-    return section_bytes(section)
-
-
-CONTAINERS: dict[str, Callable[[], bytes]] = {
-    "pcap ns": lambda: pcap_bytes(frames(LENGTH_NS)),
-    "pcap us big endian": lambda: pcap_bytes(frames(LENGTH_NS), ns=False, big_endian=True),
-    "pcap ns big endian": lambda: pcap_bytes(frames(LENGTH_NS), big_endian=True),
-    "pcapng ns": lambda: pcapng(frames(LENGTH_NS), tsresol=9),
-    "pcapng us big endian": lambda: pcapng(frames(LENGTH_NS), tsresol=6, big_endian=True),
-    "gzip": lambda: gzip.compress(pcap_bytes(frames(LENGTH_NS)), 1),
-    "zstd": lambda: zstandard.compress(pcapng(frames(LENGTH_NS), tsresol=9)),
-    "unfragmented": lambda: pcap_bytes([one.frame() for one in datagrams(LENGTH_NS)]),
-    "cooked link": lambda: pcap_bytes(
-        [one.frame(SLL2) for one in datagrams(LENGTH_NS)], linktype=SLL2
-    ),
-}
-
-
-@pytest.mark.parametrize("name", CONTAINERS)
-def test_containers_do_not_matter(name: str, wanted: Wanted, tmp_path: Path) -> None:
-    path = tmp_path / "recording"
-    path.write_bytes(CONTAINERS[name]())
-    wanted.check([path], tmp_path)
 
 
 @pytest.mark.parametrize("size", BUFFERS)
