@@ -55,12 +55,11 @@ def project(
     firing_ns: I64Array = AT_ONCE,
     hz: float = 0.0,
     table: int = 0,
-    pose: F64Array | None = None,
 ) -> F32Array:
     """Points (n, 64, 3) of columns at these rotor azimuths (n,)."""
     words = rotor_words(azimuth_deg / 360, hz, table)
     rotor = Rotor(firing_ns, project=lambda pose: hdl64_projection(file, pose))
-    return projected(rotor, words, range_m.astype(np.float32), pose)
+    return projected(rotor, words, range_m.astype(np.float32))
 
 
 NEAR = Laser(c=1.0, cx=1.2, cy=1.4)
@@ -113,13 +112,6 @@ def test_beams_fire_while_the_rotor_rotates() -> None:
     assert points[1, 1] == pytest.approx([9.9999507, -0.0314154, 0], abs=1e-6)
     still = project(unit(Laser()), np.zeros(2), ranges, firing_ns, hz=10.0, table=0)
     assert still[1, 1] == pytest.approx([10, 0, 0], abs=1e-6)
-
-
-def test_points_are_moved_into_the_body_frame() -> None:
-    # Forward becomes left; then by 1, 2, 3 m.
-    pose = np.array([[0, -1.0, 0, 1], [1, 0, 0, 2], [0, 0, 1, 3], [0, 0, 0, 1]])
-    points = project(unit(Laser(o=0.2)), np.zeros(1), np.full((1, LASERS), 10.0), pose=pose)
-    assert points[0, 0] == pytest.approx([1, 12, 3.2], abs=1e-6)
 
 
 def scalar_point(
