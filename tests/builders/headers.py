@@ -2,30 +2,25 @@
 
 from __future__ import annotations
 
-import json
-from pathlib import Path
-from typing import cast
-
 import numpy as np
 
 from mlbatch.arrays import I64Array, U8Array
 from mlbatch.lidar.headers import Headers, content_keys
 from mlbatch.lidar.interface import Lidar
-from mlbatch.sensors.ouster.sensor import read_calibration
-from mlbatch.simulate.ouster.encode import OusterSpec, encode_packets, metadata_json
+from mlbatch.simulate.ouster.encode import OusterSpec, encode_packets
+from tests.builders.others import rows
+from tests.builders.spinning import ouster_calibration
 from tests.reference.headers import read
 
 
 def ouster_packets(spec: OusterSpec, columns: int = 48) -> tuple[Lidar, U8Array]:
     """A lidar and whole packets of it, at the end of a frame and the start of the next."""
-    found = read_calibration(Path("sensor.json"), json.dumps(metadata_json(spec)).encode())
-    assert found is not None
-    lidar = cast(Lidar, found.lidar({}, None))
+    lidar = ouster_calibration(spec).lidar({}, None)
     number = spec.columns_per_frame - columns // 3 + np.arange(columns)
     frame = 65535 + number // spec.columns_per_frame
     stamp_ns = 10**18 + 97_000 * np.arange(columns)
     packets = encode_packets(spec, stamp_ns, number % spec.columns_per_frame, frame % 65536, {})
-    return lidar, np.array([np.frombuffer(packet, np.uint8) for packet in packets])
+    return lidar, rows(packets)
 
 
 def check_headers(lidar: Lidar, packets: U8Array, host_ns: I64Array) -> Headers:

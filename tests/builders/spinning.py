@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,6 +15,7 @@ from mlbatch.lidar.interface import Calibration, Evidence, Lidar, ModelFile, Nei
 from mlbatch.sensors import built_in, parse_calibration
 from mlbatch.simulate.hesai import encode as hesai
 from mlbatch.simulate.hesai.encode import HesaiSpec
+from mlbatch.simulate.ouster.encode import OusterSpec, metadata_json
 from mlbatch.simulate.robosense import encode as robosense
 from mlbatch.simulate.robosense.encode import RobosenseSpec
 from mlbatch.simulate.velodyne import encode as velodyne
@@ -131,6 +133,11 @@ def from_file(content: bytes | str, name: str = "unit.csv") -> Calibration:
     found = parse_calibration(Path(name), data)
     assert found is not None
     return found
+
+
+def ouster_calibration(spec: OusterSpec, name: str = "a.json") -> Calibration:
+    """The metadata of an Ouster."""
+    return from_file(json.dumps(metadata_json(spec)), name)
 
 
 def stream_of(spec: Spec, packets: int = 0) -> Encoded:

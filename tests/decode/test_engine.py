@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import ctypes
-import json
 import shutil
 import subprocess
 import weakref
@@ -33,8 +32,7 @@ from mlbatch.native.library import library
 from mlbatch.pipeline.conversion import Conversion
 from mlbatch.pipeline.sensor import new_ring
 from mlbatch.sensors.ouster.profiles import PROFILES
-from mlbatch.sensors.ouster.sensor import read_calibration
-from mlbatch.simulate.ouster.encode import OusterSpec, metadata_json
+from mlbatch.simulate.ouster.encode import OusterSpec
 from mlbatch.types import EXTRAS, RecordLayout, RunInfo, SensorInfo
 from mlbatch.writers.las_encoder import RECORD as LAS
 from mlbatch.writers.point_layouts import (
@@ -46,6 +44,7 @@ from mlbatch.writers.point_layouts import (
 )
 from tests.builders.engines import BOXES_M, MOST_COLUMNS, Pair, assert_same
 from tests.builders.rotor import rotor_words
+from tests.builders.spinning import ouster_calibration
 from tests.contract.tree import PACKAGE
 from tests.golden import test_every_model as models
 from tests.reference.decoder import readings_of, record_of
@@ -95,9 +94,7 @@ def ouster(profile: str, beams: int, seed: int = 0) -> Lidar:
     spec = OusterSpec(
         profile, beams, 512, altitude_deg=angles[0].tolist(), azimuth_deg=angles[1].tolist()
     )
-    found = read_calibration(Path("sensor.json"), json.dumps(metadata_json(spec)).encode())
-    assert found is not None
-    return cast(Lidar, found.lidar({}, None))
+    return ouster_calibration(spec).lidar({}, None)
 
 
 def lidar_of(make: Callable[..., models.Sent], words: tuple[str, ...], folder: Path) -> Lidar:
@@ -310,9 +307,7 @@ def level_sensor(profile: str) -> Lidar:
     """A sensor whose upper 64 beams are at elevation 0."""
     altitude_deg = (5.0,) * 64 + (0.0,) * 64
     spec = OusterSpec(profile, 128, 512, altitude_deg=altitude_deg, azimuth_deg=(0.0,) * 128)
-    found = read_calibration(Path("sensor.json"), json.dumps(metadata_json(spec)).encode())
-    assert found is not None
-    return cast(Lidar, found.lidar({}, None))
+    return ouster_calibration(spec).lidar({}, None)
 
 
 upright = pytest.mark.parametrize("profile", ["RNG15_RFL8_NIR8", "RNG19_RFL8_SIG16_NIR16"])

@@ -6,7 +6,7 @@ A row is a unit: what it sends, what is given for it. Errors as the command line
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -18,6 +18,7 @@ from mlbatch.lidar.geometry import read_rotor_words
 from mlbatch.lidar.interface import NAMED_ONLY, Calibration, Evidence, ModelFile
 from mlbatch.simulate.hesai.angles import angles_csv
 from mlbatch.simulate.hesai.encode import HesaiSpec
+from mlbatch.simulate.ouster.encode import OusterSpec
 from mlbatch.simulate.robosense import encode as robosense
 from mlbatch.simulate.robosense.encode import RobosenseSpec
 from mlbatch.simulate.robosense.models import LAST
@@ -35,6 +36,7 @@ from tests.builders.spinning import (
     evidence_of,
     from_file,
     named,
+    ouster_calibration,
     stream_of,
     velodyne_calibration,
 )
@@ -404,65 +406,59 @@ def csv_of(low_deg: float, high_deg: float) -> Calibration:
     return from_file(angles_csv(np.linspace(high_deg, low_deg, 64).tolist(), [0.0] * 64))
 
 
-REFUSED: dict[str, tuple[Callable[[], Calibration], Callable[[], Evidence | None], str]] = {
-    **{
-        f"silent {model}": (lambda model=model: file_of(model), lambda: None, text)  # type: ignore[misc]
-        for model, text in (
-            ("Pandar64", "expected packets of the lidar in the first 10 seconds"),
-            ("AT128", "expected packets of the lidar in the first 10 seconds"),
-            ("Helios 32", SILENT),
-        )
-    },
-    "silent built-in ROBOSENSE": (lambda: named("Helios 32"), lambda: None, SILENT),
-    "HDL-64E S2 without a file": (
-        lambda: named("HDL-64E S2"),
-        lambda: Unit(VelodyneSpec("HDL-64E S3")).stream.evidence,
-        "HDL-64E: expected its calibration, found none; give the unit's YAML or db.xml with",
+BUILT_IN = {one.model: one for one in sensors.built_in()}
+FIRST_10_S = "expected packets of the lidar in the first 10 seconds"
+HDL64 = "HDL-64E: expected its calibration, found none; give the unit's YAML or db.xml with"
+PANDAR64 = Unit(HesaiSpec("Pandar64"))
+# A calibration, a unit or what is known of it, and why it is refused.
+REFUSED: list[tuple[Calibration, Unit | Evidence | None, str]] = [
+    (file_of("Pandar64"), None, FIRST_10_S),
+    (file_of("AT128"), None, FIRST_10_S),
+    (file_of("Helios 32"), None, SILENT),
+    (BUILT_IN["Helios 32"], None, SILENT),
+    (BUILT_IN["Livox SDK2"], None, "Livox SDK2: expected packets of points in the first 10 sec"),
+    (BUILT_IN["PointCloud2"], None, "PointCloud2: expected a cloud of the topic in the first 10"),
+    *(
+        (BUILT_IN[name], Unit(VelodyneSpec("HDL-64E S3")), HDL64)
+        for name in ("HDL-64E S2", "HDL-64E S3")
     ),
-    "HDL-64E S3 without a file": (
-        lambda: named("HDL-64E S3"),
-        lambda: Unit(VelodyneSpec("HDL-64E S3")).stream.evidence,
-        "HDL-64E: expected its calibration, found none; give the unit's YAML or db.xml with",
-    ),
-    "Pandar64 by the file of a Pandar40P": (
-        lambda: file_of("Pandar40P"),
-        lambda: Unit(HesaiSpec("Pandar64")).stream.evidence,
+    (
+        file_of("Pandar40P"),
+        PANDAR64,
         "expected 64 channels for the packets of a Pandar64, found 40; give",
     ),
-    "Pandar64 by the file of an AT128": (
-        lambda: file_of("AT128"),
-        lambda: Unit(HesaiSpec("Pandar64")).stream.evidence,
+    (
+        file_of("AT128"),
+        PANDAR64,
         "expected the csv of a Pandar64 for these packets, found the file of",
     ),
-    "AT128 by a csv": (
-        lambda: file_of("OT128"),
-        lambda: Unit(HesaiSpec("AT128")).stream.evidence,
+    (
+        file_of("OT128"),
+        Unit(HesaiSpec("AT128")),
         "HESAI AT128: expected its correction file (.dat), found a csv",
     ),
-    "Pandar64 by the file of a PandarQT64": (
-        lambda: csv_of(-52.1, 52.1),
-        lambda: Unit(HesaiSpec("Pandar64")).stream.evidence,
+    (
+        csv_of(-52.1, 52.1),
+        PANDAR64,
         "unit.csv: expected elevations of a Pandar64, -25 to 15 deg, found -52.1 to 52.1, the "
         "file of another model; give the one of this lidar",
     ),
-    "Helios 16 by a file of 32 lines": (
-        lambda: file_of("Helios 32"),
-        lambda: Unit(HELIOS_16).stream.evidence,
-        "expected packets of a ROBOSENSE 32-line lidar",
-    ),
-    "two units on one port": (
-        lambda: named("RS-LiDAR-32"),
-        lambda: two_units({}),
+    (file_of("Helios 32"), Unit(HELIOS_16), "expected packets of a ROBOSENSE 32-line lidar"),
+    (
+        named("RS-LiDAR-32"),
+        two_units({}),
         "found those of 2 (serial numbers 0a1b2c3d4e5f, ffffffffffff)",
     ),
-}
+]
 
 
-@pytest.mark.parametrize("what", REFUSED)
-def test_what_cannot_be_decoded_is_refused_in_one_line(what: str) -> None:
-    calibration, evidence, text = REFUSED[what]
+@pytest.mark.parametrize(("calibration", "given", "text"), REFUSED)
+def test_what_cannot_be_decoded_is_refused_in_one_line(
+    calibration: Calibration, given: Unit | Evidence | None, text: str
+) -> None:
+    evidence = given.stream.evidence if isinstance(given, Unit) else given
     with pytest.raises(RigError) as caught:
-        calibration().lidar({}, evidence())
+        calibration.lidar({}, evidence)
     assert text in str(caught.value)
     assert "\n" not in str(caught.value)
 
@@ -489,8 +485,24 @@ def test_angles_of_a_robosense_are_asked_for(name: str, difops: list[bytes], fou
         ({"crc": "never"}, "expected crc=check, found never"),
     ],
 )
-@pytest.mark.parametrize("spec", [VLP32C, XT32M2X, HELIOS_32])
-def test_options_are_checked(spec: Spec, options: Mapping[str, str], text: str) -> None:
-    """Ouster, Livox and points of clouds: in their folders."""
+@pytest.mark.parametrize(
+    "calibration",
+    [
+        *(ouster_calibration(OusterSpec()), file_of("HDL-64E S2"), file_of("Pandar64")),
+        *(file_of("AT128"), file_of("Helios 32")),
+        *(named(model) for model in ("VLP-16", "Helios 32")),
+        *(BUILT_IN["Livox SDK2"], BUILT_IN["PointCloud2"]),
+    ],
+    ids=lambda one: one.model,
+)
+def test_options_are_checked(
+    calibration: Calibration, options: Mapping[str, str], text: str
+) -> None:
     with pytest.raises(UsageError, match=text):
-        stream_of(spec, 8).lidar(**options)
+        calibration.lidar(options, None)
+
+
+def test_options_of_all_vendors_are_taken_by_all() -> None:
+    options = {"crc": "check", "firing_azimuth": "on", "optical_centre": "on"}
+    lidar = ouster_calibration(OusterSpec()).lidar({**options, "vertical_offset": "off"}, None)
+    assert lidar.notes == ()

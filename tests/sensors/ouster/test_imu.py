@@ -2,25 +2,17 @@
 
 from __future__ import annotations
 
-import json
 import struct
-from pathlib import Path
 
 import numpy as np
 import pytest
 
 from mlbatch.arrays import U8Array
 from mlbatch.sensors.ouster.imu import read_legacy
-from mlbatch.sensors.ouster.sensor import OusterLidar, read_calibration
-from mlbatch.simulate.ouster.encode import OusterSpec, imu_packet, metadata_json
+from mlbatch.simulate.ouster.encode import OusterSpec, imu_packet
+from tests.builders.spinning import ouster_calibration
 
 ACCEL32 = "ACCEL32_GYRO32_NMEA"
-
-
-def lidar_of(spec: OusterSpec) -> OusterLidar:
-    found = read_calibration(Path("a.json"), json.dumps(metadata_json(spec)).encode())
-    assert found is not None
-    return found.lidar({}, None)
 
 
 def payload_of(data: bytes) -> U8Array:
@@ -28,7 +20,7 @@ def payload_of(data: bytes) -> U8Array:
 
 
 def test_a_legacy_packet_worked_by_hand() -> None:
-    lidar = lidar_of(OusterSpec(beams=16))
+    lidar = ouster_calibration(OusterSpec(beams=16)).lidar({}, None)
     data = struct.pack("<QQQffffff", 11, 22, 33, 0.5, 0.0, -1.0, 180.0, 0.0, -90.0)
     for extra in (b"", b"\x00"):
         assert lidar.is_imu(len(data + extra))
@@ -40,7 +32,7 @@ def test_a_legacy_packet_worked_by_hand() -> None:
 
 
 def test_a_new_packet_worked_by_hand() -> None:
-    lidar = lidar_of(OusterSpec(beams=16, imu_profile=ACCEL32))
+    lidar = ouster_calibration(OusterSpec(beams=16, imu_profile=ACCEL32)).lidar({}, None)
     samples = [
         struct.pack("<QHHffffff", 1000 + i, i, status, i, 0.5, 9.75, 0.25, -i, 0.0)
         for i, status in enumerate((1, 0, 0xFFFF))
@@ -66,7 +58,9 @@ def test_a_new_packet_worked_by_hand() -> None:
 def test_sizes_of_imu_packets(
     profile: str, samples: int, sizes: tuple[int, ...], others: tuple[int, ...]
 ) -> None:
-    lidar = lidar_of(OusterSpec(beams=16, imu_profile=profile, imu_samples=samples))
+    lidar = ouster_calibration(
+        OusterSpec(beams=16, imu_profile=profile, imu_samples=samples)
+    ).lidar({}, None)
     assert all(lidar.is_imu(size) for size in sizes)
     assert not any(lidar.is_imu(size) for size in others)
 
@@ -79,7 +73,7 @@ def test_encode_then_decode_is_identity(profile: str, count: int) -> None:
     acceleration, angular_velocity = rng.normal(0, 9, (count, 3)), rng.normal(0, 1, (count, 3))
     valid = np.arange(count) % 4 != 3
     data = imu_packet(spec, stamps, acceleration, angular_velocity, valid)
-    lidar = lidar_of(spec)
+    lidar = ouster_calibration(spec).lidar({}, None)
     assert lidar.is_imu(len(data))
     found = lidar.imu(payload_of(data)[None], 0)
     assert found.stamp_ns.tolist() == stamps[valid].tolist()

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mlbatch.errors import RigError, UsageError
+from mlbatch.errors import RigError
 from mlbatch.sensors.ouster.metadata import Metadata
 from mlbatch.sensors.ouster.sensor import OusterCalibration, read_calibration
 from mlbatch.simulate.ouster.encode import JsonObject, OusterSpec, flat_json, metadata_json
@@ -194,21 +194,6 @@ def test_beams_lifted_from_the_rotor_plane_and_a_turned_sensor() -> None:
         origin = cosine * table.origin[0] + sine * table.origin[1] + table.origin[2]
         xyz = (1.0 + table.reach_m)[:, None] * direction + origin
         np.testing.assert_allclose(xyz, [up, level], atol=1e-12)
-
-
-def test_options_of_this_and_other_vendors() -> None:
-    calibration = read(metadata_json(SPEC))
-    calibration.lidar(
-        {"crc": "check", "firing_azimuth": "on", "vertical_offset": "off", "optical_centre": "on"},
-        None,
-    )
-    known = "crc, firing_azimuth, optical_centre, packet_stamp, range_unit, vertical_offset"
-    with pytest.raises(
-        UsageError, match=f"--decode colour=red: expected one of {known}, found colour"
-    ):
-        calibration.lidar({"colour": "red"}, None)
-    with pytest.raises(UsageError, match="expected crc=check, found never"):
-        calibration.lidar({"crc": "never"}, None)
 
 
 def test_a_serial_number_may_be_a_number_or_absent() -> None:

@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import json
 from itertools import product
-from pathlib import Path
-from typing import cast
 
 import numpy as np
 import pytest
@@ -15,9 +12,10 @@ from hypothesis import strategies as st
 from mlbatch.arrays import U8Array
 from mlbatch.lidar.interface import Lidar
 from mlbatch.sensors.ouster.profiles import HEADER_TYPES, HEADERS, OFF, PROFILES, PacketLayout
-from mlbatch.sensors.ouster.sensor import OusterLidar, read_calibration
-from mlbatch.simulate.ouster.encode import IntLike, OusterSpec, encode_packets, metadata_json
+from mlbatch.simulate.ouster.encode import IntLike, OusterSpec, encode_packets
 from tests.builders.decoded import readings
+from tests.builders.others import rows
+from tests.builders.spinning import ouster_calibration
 from tests.reference import ouster as reference
 
 # One pixel a profile, worked by hand from the sheet. Words that occur again and again:
@@ -67,21 +65,8 @@ SIZES = {
 }
 
 
-def lidar_of(spec: OusterSpec) -> OusterLidar:
-    content = json.dumps(metadata_json(spec)).encode()
-    found = read_calibration(Path("sensor.json"), content)
-    assert found is not None
-    return found.lidar({"crc": "check"}, None)
-
-
-def stacked(packets: list[bytes]) -> U8Array:
-    return np.array([np.frombuffer(packet, np.uint8) for packet in packets])
-
-
-def records_of(lidar: OusterLidar, packets: U8Array) -> U8Array:
-    size = lidar.columns_per_packet * lidar.records.size
-    body = packets[:, lidar.records.start : lidar.records.start + size]
-    return np.ascontiguousarray(body.reshape(-1, lidar.records.size))
+def lidar_of(spec: OusterSpec) -> Lidar:
+    return ouster_calibration(spec).lidar({"crc": "check"}, None)
 
 
 def test_all_profiles_are_checked_by_hand() -> None:
@@ -123,7 +108,7 @@ def test_a_pixel_worked_by_hand(name: str) -> None:
     columns[:, :, head : head + 16 * len(pixel)] = 0
     first = head + at * len(pixel)
     columns[1, 3, first : first + len(pixel)] = np.frombuffer(pixel, np.uint8)
-    found = readings(cast(Lidar, lidar), packets)
+    found = readings(lidar, packets)
     assert found.reflectivity is not None
     assert found.range_m.shape == (32, 16, len(returns))
     for which, (range_mm, reflectivity, intensity) in enumerate(returns):
@@ -139,7 +124,7 @@ def test_every_coarse_range_is_rounded_correctly() -> None:
     raw = np.arange(2**15).reshape(-1, 128)
     mids = np.arange(len(raw))
     sent = encode_packets(spec, mids, mids, np.zeros(len(raw), np.int64), {"RANGE": raw << 3})
-    found = readings(cast(Lidar, lidar_of(spec)), stacked(sent)).range_m
+    found = readings(lidar_of(spec), rows(sent)).range_m
     # Python divides the exact integers; the second rounding cannot err, 53 bits being enough.
     expected = [float(np.float32(8 * value / 1000)) for value in raw.ravel().tolist()]
     assert found.ravel().tolist() == expected
@@ -174,7 +159,7 @@ def test_encode_then_decode_is_identity(
     mids = block * 16 + np.arange(columns)
     valid = rng.random(columns) < 0.8
     sent = encode_packets(spec, stamps, mids, np.full(columns, frame), fields, valid)
-    packets = stacked(sent)
+    packets = rows(sent)
     assert packets.shape == (2, SIZES[spec.profile][spec.beams]) == (2, lidar.packet_size)
     assert lidar.faults(packets).tolist() == [0, 0]
     assert lidar.sent_by_me(packets).all()
@@ -183,7 +168,7 @@ def test_encode_then_decode_is_identity(
     assert np.array_equal(headers.stamp_ns.ravel(), stamps)
     assert np.array_equal(headers.encoder.ravel(), mids)
     assert np.array_equal(headers.valid.ravel(), valid)
-    found = readings(cast(Lidar, lidar), packets)
+    found = readings(lidar, packets)
     assert found.reflectivity is not None
     for which, suffix in enumerate(("", "2")[: lidar.returns]):
         range_m = (fields[f"RANGE{suffix}"] / 1000).astype(np.float32)
@@ -198,7 +183,7 @@ def test_encode_then_decode_is_identity(
 
 def two_packets(spec: OusterSpec, frame: int = 7, first: int = 0) -> U8Array:
     mids = first + np.arange(2 * spec.columns_per_packet)
-    return stacked(encode_packets(spec, mids * 97_656, mids, np.full(len(mids), frame), {}))
+    return rows(encode_packets(spec, mids * 97_656, mids, np.full(len(mids), frame), {}))
 
 
 def test_columns_beyond_the_frame_are_not_valid() -> None:
@@ -233,7 +218,7 @@ def test_packets_of_a_window_are_numbered_without_gaps(
     spec = OusterSpec(beams=16, columns_per_frame=512, window=window)
     lidar = lidar_of(spec)
     mids = np.arange(512)
-    revolution = stacked(encode_packets(spec, mids, mids, np.full(512, 3), {}))
+    revolution = rows(encode_packets(spec, mids, mids, np.full(512, 3), {}))
     numbers = lidar.sequence(revolution)
     assert lidar.sequence_modulus == packets * 2**16
     assert numbers[blocks].tolist() == [3 * packets + rank for rank in range(packets)]

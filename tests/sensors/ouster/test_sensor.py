@@ -13,23 +13,18 @@ import pytest
 from mlbatch.arrays import U8Array
 from mlbatch.lidar.interface import Evidence
 from mlbatch.sensors import describe
-from mlbatch.sensors.ouster.sensor import OusterCalibration
 from mlbatch.sensors.ouster.sensor import read_calibration as read_content
 from mlbatch.simulate.ouster.encode import OusterSpec, encode_packets, imu_packet, metadata_json
 from mlbatch.types import Stream
+from tests.builders.others import rows
+from tests.builders.spinning import ouster_calibration
 from tests.builders.streams import beside
-
-
-def calibration_of(spec: OusterSpec) -> OusterCalibration:
-    found = read_content(Path("a.json"), json.dumps(metadata_json(spec)).encode())
-    assert found is not None
-    return found
 
 
 def packets_of(spec: OusterSpec, columns: int = 32) -> U8Array:
     mids = np.arange(columns)
     packets = encode_packets(spec, 10**9 + mids, mids, np.full(columns, 7), {})
-    return np.array([np.frombuffer(packet, np.uint8) for packet in packets])
+    return rows(packets)
 
 
 def seen(packets: U8Array, port: int = 7502, *sizes: tuple[int, int]) -> Evidence:
@@ -51,22 +46,22 @@ def test_serial_numbers_decide_then_configuration_then_ports() -> None:
         replace(spec, serial=0),
         replace(spec, serial=0, init_id=6, lidar_port=7999, imu_port=7999),
     ]
-    fits = [calibration_of(candidate).match_score(packets) for candidate in order]
+    fits = [ouster_calibration(candidate).match_score(packets) for candidate in order]
     assert fits == sorted(set(fits), reverse=True)
     assert fits[-1] > 0
-    assert calibration_of(replace(spec, serial=112)).match_score(packets) == 0
+    assert ouster_calibration(replace(spec, serial=112)).match_score(packets) == 0
 
 
 def test_packets_without_serial_number_fit_any_unit() -> None:
     spec = OusterSpec(beams=16, serial=0, init_id=0)
-    assert calibration_of(replace(spec, serial=111)).match_score(seen(packets_of(spec))) > 0
+    assert ouster_calibration(replace(spec, serial=111)).match_score(seen(packets_of(spec))) > 0
 
 
 def test_size_and_size_plus_one_fit() -> None:
     spec = OusterSpec(beams=16)
     packets = packets_of(spec)
     longer = np.hstack([packets, np.zeros((2, 1), np.uint8)])
-    calibration = calibration_of(spec)
+    calibration = ouster_calibration(spec)
     assert calibration.match_score(seen(packets)) == calibration.match_score(seen(longer)) > 0
     assert calibration.match_score(seen(np.hstack([longer, longer[:, :1]]))) == 0
     assert calibration.match_score(seen(packets[:, :-1])) == 0
@@ -78,7 +73,7 @@ def test_other_bytes_of_the_right_size_do_not_fit(profile: str) -> None:
     spec = OusterSpec(profile=profile, beams=16)
     shape = packets_of(spec).shape
     noise = np.random.default_rng(1).integers(0, 256, shape, np.uint8)
-    assert calibration_of(spec).match_score(seen(noise)) == 0
+    assert ouster_calibration(spec).match_score(seen(noise)) == 0
 
 
 def test_metadata_of_a_lidar_that_is_off_fit_nothing() -> None:

@@ -11,7 +11,6 @@ import pytest
 import mlbatch
 from mlbatch import sensors
 from mlbatch.arrays import F32Array, F64Array, U8Array
-from mlbatch.errors import RigError, UsageError
 from mlbatch.frames.transforms import from_quaternion
 from mlbatch.lidar.interface import FAULTS, Calibration, Evidence, Lidar
 from mlbatch.ros.point_packets import Layout, Points, layout_of, pack
@@ -111,15 +110,6 @@ def test_no_vendor_claims_cloud_packets(by_ring: bool) -> None:
         assert words.startswith("lidar points")
         fits = {c.model: c.match_score(_evidence(packets)) for c in sensors.built_in()}
         assert {model for model, fit in fits.items() if fit} == {"PointCloud2"}
-
-
-def test_a_silent_topic_is_asked_for() -> None:
-    with pytest.raises(
-        RigError, match="PointCloud2: expected a cloud of the topic in the first 10"
-    ):
-        CLOUD.lidar({}, None)
-    with pytest.raises(UsageError, match="--decode speed=up"):
-        CLOUD.lidar({"speed": "up"}, None)
 
 
 def test_columns_have_the_stamp_of_their_points() -> None:
