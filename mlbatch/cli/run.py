@@ -33,7 +33,7 @@ from mlbatch.writers import discard, report_paths
 # Loaded where it is needed: a dry run has no files.
 if TYPE_CHECKING:
     from mlbatch.pipeline.files import Files
-    from mlbatch.pipeline.shards import Shard
+    from mlbatch.pipeline.job import Shard
     from mlbatch.report.limits import Limit
 
 

@@ -23,7 +23,7 @@ from mlbatch.writers import parse_jobs
 
 if TYPE_CHECKING:
     from mlbatch.faults import Fault
-    from mlbatch.pipeline.shards import Shard
+    from mlbatch.pipeline.job import Shard
     from mlbatch.report.limits import Limit
 
 
@@ -159,7 +159,7 @@ def shard(text: str | None) -> Shard | None:
     if text is None:
         return None
     # Not loaded for runs without shards.
-    from mlbatch.pipeline.shards import parse_shard
+    from mlbatch.pipeline.job import parse_shard
 
     return parse_shard(text)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from dataclasses import dataclass, field
 from fractions import Fraction
 from operator import index
@@ -18,7 +19,6 @@ from mlbatch.units import NS_PER_S
 
 if TYPE_CHECKING:
     from mlbatch.faults import Fault
-    from mlbatch.pipeline.shards import Shard
 
 DEFAULT_RATE = Fraction(10)
 DEFAULT_MAX_WAIT_NS = NS_PER_S
@@ -32,6 +32,32 @@ class TimeSegment(NamedTuple):
 
     begin_ns: int | None = None
     end_ns: int | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Shard:
+    """One of the shards of a conversion."""
+
+    number: int  # from 1
+    count: int
+
+    def __str__(self) -> str:
+        return f"{self.number}/{self.count}"
+
+    def has(self, file: int) -> bool:
+        """Whether a file is of this shard, by its number."""
+        return file % self.count == self.number - 1
+
+
+def parse_shard(text: str) -> Shard:
+    """`--shard K/N`: K from 1 to N."""
+    match = re.fullmatch(r"(\d{1,6})/(\d{1,6})", text, re.ASCII)
+    shard = Shard(int(match[1]), int(match[2])) if match else Shard(0, 0)
+    if not 1 <= shard.number <= shard.count:
+        raise UsageError(
+            f"--shard: expected K/N with K from 1 to N, found {text!r}; write --shard 1/8"
+        )
+    return shard
 
 
 @dataclass(frozen=True, slots=True)

@@ -10,7 +10,6 @@ the points of its own scans. From those of all shards the report follows.
 from __future__ import annotations
 
 import json
-import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -21,6 +20,7 @@ import mlbatch
 from mlbatch.bounded import parse_json, read_text
 from mlbatch.errors import RecordingError, UsageError
 from mlbatch.pipeline.files import Files, records
+from mlbatch.pipeline.job import Shard
 from mlbatch.pipeline.job_identity import identity_of_parts
 from mlbatch.report.json_records import from_json, to_json
 from mlbatch.report.report import RunReport
@@ -38,32 +38,6 @@ from mlbatch.writers.bag_metadata import METADATA
 from mlbatch.writers.output_file import file_crc
 
 SCHEMA = "mlbatch.shard/4"
-
-
-@dataclass(frozen=True, slots=True)
-class Shard:
-    """One of the shards of a conversion."""
-
-    number: int  # from 1
-    count: int
-
-    def __str__(self) -> str:
-        return f"{self.number}/{self.count}"
-
-    def has(self, file: int) -> bool:
-        """Whether a file is of this shard, by its number."""
-        return file % self.count == self.number - 1
-
-
-def parse_shard(text: str) -> Shard:
-    """`--shard K/N`: K from 1 to N."""
-    match = re.fullmatch(r"(\d{1,6})/(\d{1,6})", text, re.ASCII)
-    shard = Shard(int(match[1]), int(match[2])) if match else Shard(0, 0)
-    if not 1 <= shard.number <= shard.count:
-        raise UsageError(
-            f"--shard: expected K/N with K from 1 to N, found {text!r}; write --shard 1/8"
-        )
-    return shard
 
 
 def check_format(name: str, options: WriterOptions) -> None:

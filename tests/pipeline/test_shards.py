@@ -5,7 +5,7 @@ from __future__ import annotations
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mlbatch.pipeline.shards import Shard, parse_shard
+from mlbatch.pipeline.job import Shard, parse_shard
 
 
 @given(file=st.integers(-100, 10**9), count=st.integers(1, 200))
