@@ -24,7 +24,7 @@ from mlbatch.verification.report_checks import ReportFiles
 from mlbatch.verification.verdict import Verdict, outcomes
 
 if TYPE_CHECKING:
-    from mlbatch.outputs.rosbag2 import BagFile
+    from mlbatch.verification.indexes import BagFile
 
 _RANGES = "ranges to 1 m: beams do not leave from the origin of their sensor"
 _NO_REPORT = "no report in or next to the output; give it with --report"
@@ -110,7 +110,8 @@ def _check_files(form: FileFormat, output: Output) -> Verdict:
 
 
 def _check_rosbag2(output: Output) -> Verdict:
-    from mlbatch.outputs.rosbag2 import check_metadata, open_bag
+    from mlbatch.outputs.rosbag2 import open_bag
+    from mlbatch.verification.indexes import check_metadata
 
     paths, about = open_bag(output.log, output.path)
 
@@ -127,13 +128,15 @@ def _check_mcap(
     check_yaml: Callable[[TopicChecks, Sequence[BagFile]], None] | None = None,
 ) -> Verdict:
     from mlbatch.outputs.mcap_file import McapFile
-    from mlbatch.outputs.rosbag2 import BagFile
+    from mlbatch.verification.indexes import BagFile, McapIndexChecks
 
     log = output.log
     grids = []
     mcaps = []
+    indexes = []
     for path in paths:
-        file = McapFile(log, path, path.name)
+        index = McapIndexChecks(log, path.name)
+        file = McapFile(log, path, path.name, index)
         grid = file.metadata.get("mlbatch.grid")
         if grid is None:
             raise VerifyError(
@@ -147,6 +150,7 @@ def _check_mcap(
         log.equal("metadata", f"{path.name} profile", "ros2", file.profile)
         grids.append(grid)
         mcaps.append(file)
+        indexes.append(index)
     where = paths[0].name
     for path, grid in zip(paths[1:], grids[1:], strict=True):
         log.equal("metadata", f"{path.name} mlbatch.grid", grids[0], grid)
@@ -163,12 +167,12 @@ def _check_mcap(
     examination = Examination(log, str(output.path), metadata, files, output.progress)
     topics = TopicChecks(log, metadata, examination, files.report)
     found = []
-    for path, file in zip(paths, mcaps, strict=True):
+    for path, file, index in zip(paths, mcaps, indexes, strict=True):
         before = topics.counts.total()
         topics.begin_file()
         for message in file.messages():
             topics.check(message)
-        found.append(BagFile(path.name, topics.counts.total() - before, file.span_ns))
+        found.append(BagFile(path.name, topics.counts.total() - before, index.span_ns))
     topics.finish(where if len(paths) == 1 else output.path.name)
     if check_yaml is not None:
         check_yaml(topics, found)
