@@ -8,7 +8,6 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 import pytest
 
 from mlbatch.arrays import F64Array, I64Array
@@ -171,44 +170,7 @@ def test_points_are_sorted_by_column_then_channel(tmp_path: Path) -> None:
     assert (scan.index, scan.start_ns, scan.complete) == (3, START_NS, True)
 
 
-def test_two_returns_share_a_ring_and_are_typed_by_range(tmp_path: Path) -> None:
-    """Numbering of docs/sources/outputs.md section 3; the strongest comes first."""
-    strong = _ranges(c0_b0=1000, c0_b1=5000, c0_b2=3000)
-    weak = _ranges(c0_b0=4000, c0_b1=2000)
-    one = StoredSensor(tmp_path, DUAL, {"RANGE": strong, "RANGE2": weak})
-    scan = _scan(_decoder(one), [one], [(0, 0)])
-    assert scan.ring.tolist() == [0, 0, 1, 1, 2]
-    assert scan.range_m is not None
-    assert scan.range_m.tolist() == [1.0, 4.0, 5.0, 2.0, 3.0]
-    # strongest-first, weak-last; strongest-last, weak-first; the only one.
-    assert scan.return_type.tolist() == [3, 6, 4, 5, 7]
-
-
-def test_columns_of_sensors_are_merged_by_timestamp(tmp_path: Path) -> None:
-    first = StoredSensor(tmp_path, FLAT, {"RANGE": _ranges(1000)})
-    second = StoredSensor(tmp_path, DUAL, {"RANGE": _ranges(2000)}, ring_base=16)
-    order = [(1, 0), (0, 5), (0, 6), (1, 1), (0, 7)]
-    scan = _scan(_decoder(first, second), [first, second], order)
-    assert scan.lidar_id.tolist() == np.repeat([1, 0, 0, 1, 0], 16).tolist()
-    assert scan.column_lidar_id.tolist() == [1, 0, 0, 1, 0]
-    assert scan.ring[:32].tolist() == [*range(16, 32), *range(16)]
-    assert scan.range_m is not None
-    assert scan.range_m.tolist() == np.repeat([2.0, 1.0, 1.0, 2.0, 1.0], 16).tolist()
-    assert (scan.columns_per_sensor, scan.max_gap_ns) == ((3, 2), (200_000, 300_000))
-
-
 # -- slots without a point ------------------------------------------------------------------------
-
-
-def test_every_slot_is_written_or_counted(tmp_path: Path) -> None:
-    ranges = _ranges(c256_b2=400, c256_b3=4000, c256_b4=8000, c0_b5=4000)
-    one = StoredSensor(tmp_path, FLAT, {"RANGE": ranges}, min_range_m=0.5, max_range_m=6.0)
-    decoder = _decoder(one, boxes=[[-5, -1, -1, -3, 1, 1]])
-    scan = _scan(decoder, [one], [(0, 256), (0, 0)])
-    assert _xyz(scan) == [[4, 0, 0]]
-    (counts,) = decoder.counts
-    assert (counts.slots, counts.no_return, counts.range, counts.box) == (32, 28, 2, 1)
-    assert (counts.repeated, counts.written) == (0, 1)
 
 
 def test_an_empty_window_gives_an_empty_scan(tmp_path: Path) -> None:
@@ -250,41 +212,6 @@ def test_organized_slots_are_channel_by_return(tmp_path: Path) -> None:
 
 
 # -- tiles and buffers ----------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("layout", ["dense", "organized"])
-@pytest.mark.parametrize("other", ["flat", "dual"])
-def test_a_scan_is_that_of_its_columns(tmp_path: Path, layout: str, other: str) -> None:
-    """The scans of its columns, one after the other."""
-    rng = np.random.default_rng(4)
-    first, second = (
-        StoredSensor(
-            tmp_path,
-            spec,
-            {
-                "RANGE": rng.integers(0, 900, (COLUMNS, 16))
-                * 8
-                * rng.integers(0, 2, (COLUMNS, 16)),
-                "REFLECTIVITY": rng.integers(0, 256, (COLUMNS, 16)),
-            },
-            ring_base=base,
-        )
-        for spec, base in ((FLAT, 0), ({"flat": FLAT, "dual": DUAL}[other], 16))
-    )
-    stored = [first, second]
-    count = 700
-    columns = [(int(s), int(m)) for s, m in rng.integers(0, [2, COLUMNS], (count, 2))]
-    whole = _scan(_decoder(*stored, layout=layout), stored, columns)
-    decoder = _decoder(*stored, layout=layout)
-    singles = [_arrays(_scan(decoder, stored, [column])) for column in columns]
-    for number, array in enumerate(_arrays(whole)):
-        np.testing.assert_array_equal(array, np.concatenate([one[number] for one in singles]))
-
-
-def _arrays(scan: Scan) -> list[npt.NDArray[np.generic]]:
-    """Copies, since the next scan reuses the arrays."""
-    assert scan.reflectivity is not None
-    return [a.copy() for a in (scan.xyz, scan.ring, scan.lidar_id, scan.reflectivity)]
 
 
 def test_a_smaller_scan_after_a_larger_one_has_no_stale_points(tmp_path: Path) -> None:

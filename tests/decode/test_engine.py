@@ -401,6 +401,26 @@ def alone(drawn: Drawn) -> None:
 
 
 @pytest.mark.parametrize("layout", ["dense", "organized"])
+@pytest.mark.parametrize("second", ["RNG19_RFL8_SIG16_NIR16", "RNG19_RFL8_SIG16_NIR16_DUAL"])
+def test_a_scan_is_that_of_its_columns(layout: str, second: str) -> None:
+    """The scans of its columns, one after the other."""
+    case = Case(4, 700, layout, EXTRAS, is_cut=False, keeps_repeated=True)
+    drawn = Drawn([ouster("RNG19_RFL8_SIG16_NIR16", 16), ouster(second, 16)], case)
+    columns = drawn.columns()
+    whole, single = (Decoder(drawn.info, drawn.sources, drawn.boxes_m, EXTRAS) for _ in range(2))
+    names = ("xyz", "ring", "lidar_id", "reflectivity")
+    # The next scan reuses the arrays.
+    parts = [
+        [getattr(scan, name).copy() for name in names]
+        for number in range(len(columns))
+        for scan in [single.scan(columns.take(np.array([number])), HEADER)]
+    ]
+    scan = whole.scan(columns, HEADER)
+    for name, arrays in zip(names, zip(*parts, strict=True), strict=True):
+        np.testing.assert_array_equal(getattr(scan, name), np.concatenate(arrays))
+
+
+@pytest.mark.parametrize("layout", ["dense", "organized"])
 @pytest.mark.parametrize("chosen", [[0], [2], [3, 0], [5, 8, 2, 9], [6, 7]])
 def test_nothing_is_written_beyond_the_arrays(
     layout: str, chosen: list[int], others: list[Lidar], monkeypatch: pytest.MonkeyPatch
