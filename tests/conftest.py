@@ -54,7 +54,7 @@ LONG = (
     "outputs/test_read.py",
     "page/test_windows.py::test_long_runs",
     "pipeline/test_resume.py",
-    "readers/capture/test_fragments.py::test_the_fast_ways",
+    "readers/formats/test_bags.py",
     "readers/test_buffer_ends.py",
     "rig/test_extrinsics_files.py::test_any_text",
     "sensors/test_round_trip.py",
@@ -64,7 +64,7 @@ LONG = (
     "writers/test_durable.py",
     "writers/test_formats.py",
     "writers/test_mcap_container.py",
-    "writers/test_message_writer.py",
+    "writers/test_messages.py",
 )
 
 

@@ -35,8 +35,8 @@ from mlbatch.pipeline.run import _Output
 from mlbatch.simulate.ouster.encode import OusterSpec
 from tests.builders.bags import Body, Recorded, imu_message, packet_message
 from tests.builders.captures import write_pcap
+from tests.builders.mcaps import write_mcap
 from tests.builders.sessions import NS_PER_MS, NS_PER_S, Unit, twin, write_metadata
-from tests.builders.sessions_of_bags import write_mcap
 
 TURN_NS = 100 * NS_PER_MS
 SPEC = OusterSpec(beams=32, columns_per_frame=512, serial=111)

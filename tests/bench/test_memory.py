@@ -14,8 +14,9 @@ import pytest
 from mlbatch.discovery.sampler import MOST_KINDS
 from tests.builders.bags import Body, Recorded
 from tests.builders.captures import udp_frame
+from tests.builders.mcaps import write_mcap
 from tests.builders.sessions import NS_PER_S, REPOSITORY, Unit, write_session
-from tests.builders.sessions_of_bags import unit_messages, write_mcap
+from tests.builders.sessions_of_bags import unit_messages
 
 pytestmark = pytest.mark.skipif(
     not Path("/proc/self/status").exists(), reason="needs the peak memory of a process"

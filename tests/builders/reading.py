@@ -3,14 +3,19 @@
 from __future__ import annotations
 
 import socket
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
 import dpkt
+import pytest
 
+from mlbatch.errors import RecordingError
 from mlbatch.readers import open_recording
+from mlbatch.readers.bag.recording import BagRecording
 from mlbatch.readers.capture.recording import CaptureRecording
-from mlbatch.types import PacketBatch, Recording, StreamTable
+from mlbatch.readers.formats import mcap, rosbag1, rosbag2
+from mlbatch.types import Message, PacketBatch, Recording, StreamTable
 
 RECORDINGS = Path(__file__).resolve().parents[3] / "shared" / "recordings"
 
@@ -37,6 +42,32 @@ def open_capture(
     return recording
 
 
+def open_bag(
+    path: Path, *, keep: Iterable[str] = (), buffer_bytes: int | None = None
+) -> BagRecording:
+    """A bag, opened by its content; with the buffer of a test, if it is one file."""
+    table = StreamTable()
+    recording = open_recording(path, table)
+    if buffer_bytes and recording.container == rosbag1.CONTAINER:
+        recording = rosbag1.open_packets(path, table, buffer_bytes)
+    elif buffer_bytes:
+        module = mcap if recording.container == mcap.CONTAINER else rosbag2
+        recording = module.open_folder(path, [path], table, buffer_bytes=buffer_bytes)
+    assert isinstance(recording, BagRecording)
+    recording.keep = frozenset(keep)
+    return recording
+
+
+def refusal(path: Path) -> str:
+    """The one line that says why `path` cannot be opened."""
+    with pytest.raises(RecordingError) as caught:
+        open_recording(path, StreamTable())
+    line = str(caught.value)
+    assert line.startswith(str(path))
+    assert "\n" not in line
+    return line
+
+
 def seen_of(batch: PacketBatch, streams: StreamTable) -> list[Seen]:
     """The packets of a batch."""
     columns = (batch.start, batch.size, batch.stream, batch.host_ns)
@@ -46,13 +77,22 @@ def seen_of(batch: PacketBatch, streams: StreamTable) -> list[Seen]:
     ]
 
 
-def read(recording: CaptureRecording) -> list[Seen]:
+def read(recording: CaptureRecording | BagRecording) -> list[Seen]:
     """All packets; the ledger must balance afterwards."""
-    seen = []
+    return read_kept(recording)[0]
+
+
+def read_kept(recording: CaptureRecording | BagRecording) -> tuple[list[Seen], list[Message]]:
+    """All packets and the messages that are kept; the ledger must balance afterwards."""
+    seen: list[Seen] = []
+    messages: list[Message] = []
     for batch in recording.packets():
         seen += seen_of(batch, recording.streams)
+        messages += batch.messages
     assert_balanced(recording)
-    return seen
+    assert recording.position_bytes <= recording.size_bytes
+    assert all("\n" not in note for note in recording.notes)
+    return seen, messages
 
 
 def assert_balanced(recording: Recording) -> None:

@@ -9,24 +9,23 @@ from __future__ import annotations
 import itertools
 import json
 import sqlite3
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 import zstandard
-from mcap.writer import CompressionType, Writer
 
 from mlbatch.simulate.ouster.encode import metadata_json
+from tests.builders import mcaps
 from tests.builders.bags import (
     OUSTER_ROS1,
     Body,
     Recorded,
-    definition,
     fixture_messages,
     fixture_packets,
     packet_message,
 )
 from tests.builders.captures import Packet, Section, write_pcapng
+from tests.builders.mcaps import LZ4, ZSTD, write_mcap
 from tests.builders.rosbag1 import write_rosbag1
 from tests.builders.rosbag2 import Form, write_folder, write_rosbag2
 from tests.builders.run import TWO_LIDARS
@@ -57,58 +56,6 @@ def split_at(messages: Sequence[Recorded], parts: int) -> list[list[Recorded]]:
     """Messages in consecutive parts of about equal length."""
     bounds = [len(messages) * part // parts for part in range(parts + 1)]
     return [list(messages[a:b]) for a, b in itertools.pairwise(bounds)]
-
-
-_DATA_END = 15
-
-
-@dataclass(frozen=True, slots=True)
-class Mcap:
-    """How an MCAP file is made; without a summary it ends at its last record, and then `tail`."""
-
-    encoding: str = "cdr"
-    compression: CompressionType = CompressionType.NONE
-    chunked: bool = True
-    summary: bool = True
-    tail: bytes = b""
-
-
-def write_mcap(path: Path, messages: Iterable[Recorded], form: Mcap | None = None) -> Path:
-    """An MCAP file of ROS 2, or of ROS 1."""
-    form = form or Mcap()
-    encoding = form.encoding
-    ros = "ros1" if encoding == "ros1" else "ros2"
-    qos = {True: "- durability: transient_local", False: "- durability: volatile"}
-    with path.open("wb") as file:
-        writer = Writer(file, 200_000, compression=form.compression, use_chunking=form.chunked)
-        writer.start(ros)
-        schemas: dict[str, int] = {}
-        channels: dict[str, int] = {}
-        for message in messages:
-            if message.type not in schemas:
-                name = message.type if ros == "ros1" else message.type.replace("/", "/msg/")
-                text = definition(message.type, encoding).encode()
-                schemas[message.type] = writer.register_schema(name, f"{ros}msg", text)
-            if message.topic not in channels:
-                about = {"offered_qos_profiles": qos[message.latched]} if ros == "ros2" else {}
-                channels[message.topic] = writer.register_channel(
-                    message.topic, encoding, schemas[message.type], about
-                )
-            at = message.log_ns
-            writer.add_message(channels[message.topic], at, message.data, at)
-        end: Callable[[], None] = writer.finish
-        end()
-    data = path.read_bytes()
-    path.write_bytes((data if form.summary else _without_end(data)) + form.tail)
-    return path
-
-
-def _without_end(data: bytes) -> bytes:
-    """An MCAP file up to its record DataEnd, as a recorder that was killed leaves it."""
-    at = 8
-    while data[at] != _DATA_END:
-        at += 9 + int.from_bytes(data[at + 1 : at + 9], "little")
-    return data[:at]
 
 
 def _pcapng(folder: Path) -> Path:
@@ -143,7 +90,7 @@ def _folder(folder: Path) -> Path:
     return write_folder(folder / "bag", split_at(packets_only("cdr"), 3))
 
 
-def _mcap(form: Mcap) -> Write:
+def _mcap(form: mcaps.Form) -> Write:
     def write(folder: Path) -> Path:
         return write_mcap(folder / "a.mcap", packets_only(form.encoding), form)
 
@@ -170,13 +117,13 @@ CONTAINERS: Mapping[str, Write] = {
     "db3, zstd messages": _db3(Form(zstd_messages=True)),
     "db3, zstd file": _packed_db3,
     "db3, folder of three": _folder,
-    "MCAP": _mcap(Mcap()),
-    "MCAP, lz4": _mcap(Mcap(compression=CompressionType.LZ4)),
-    "MCAP, zstd": _mcap(Mcap(compression=CompressionType.ZSTD)),
-    "MCAP, unchunked": _mcap(Mcap(chunked=False)),
-    "MCAP, cut off": _mcap(Mcap(chunked=False, summary=False, tail=CUT_RECORD)),
-    "MCAP, chunks cut off": _mcap(Mcap(summary=False, tail=CUT_RECORD)),
-    "MCAP of ROS 1": _mcap(Mcap("ros1")),
+    "MCAP": _mcap(mcaps.Form()),
+    "MCAP, lz4": _mcap(mcaps.Form(compression=LZ4)),
+    "MCAP, zstd": _mcap(mcaps.Form(compression=ZSTD)),
+    "MCAP, unchunked": _mcap(mcaps.Form(chunked=False)),
+    "MCAP, cut off": _mcap(mcaps.Form(chunked=False, summary=False, tail=CUT_RECORD)),
+    "MCAP, chunks cut off": _mcap(mcaps.Form(summary=False, tail=CUT_RECORD)),
+    "MCAP of ROS 1": _mcap(mcaps.Form("ros1")),
     "MCAP, folder of three": _mcap_folder,
 }
 

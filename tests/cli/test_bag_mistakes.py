@@ -11,6 +11,7 @@ import pytest
 
 from mlbatch.simulate.ouster.encode import metadata_json
 from tests.builders.bags import Body, Recorded, transforms_message
+from tests.builders.mcaps import write_mcap
 from tests.builders.points import XYZ, cloud_message
 from tests.builders.rosbag1 import write_rosbag1
 from tests.builders.rosbag2 import write_folder, write_rosbag2
@@ -22,7 +23,6 @@ from tests.builders.sessions_of_bags import (
     told,
     unit_messages,
     urdf,
-    write_mcap,
 )
 from tests.builders.transcripts import transcripts
 

@@ -16,6 +16,7 @@ from mlbatch.types import Scan
 from mlbatch.writers.message_writer import CloudMessage
 from mlbatch.writers.point_layouts import CLOUD_LAYOUTS, clipped_points
 from tests.builders.captures import udp_frame, write_pcap
+from tests.builders.mcaps import write_mcap
 from tests.builders.points import OUSTER, STAMP_NS, cloud_message, write_points
 from tests.builders.scans import dense_scan
 from tests.builders.sessions import (
@@ -26,7 +27,6 @@ from tests.builders.sessions import (
     report_of,
     write_metadata,
 )
-from tests.builders.sessions_of_bags import write_mcap
 
 SPEC = OusterSpec(profile="RNG19_RFL8_SIG16_NIR16", beams=16, columns_per_frame=512, serial=111)
 COLUMN_NS = 100 * NS_PER_MS // 512

@@ -10,6 +10,7 @@ from mcap.reader import make_reader
 
 from mlbatch.simulate.ouster.encode import OusterSpec
 from tests.builders.bags import Body, Recorded
+from tests.builders.mcaps import write_mcap
 from tests.builders.sessions import (
     NO_RECORDINGS,
     NS_PER_MS,
@@ -22,7 +23,7 @@ from tests.builders.sessions import (
     twin,
     write_session,
 )
-from tests.builders.sessions_of_bags import unit_messages, write_mcap
+from tests.builders.sessions_of_bags import unit_messages
 
 TAI_S = 37
 PTP_SPEC: OusterSpec = replace(SMALL, timestamp_mode="TIME_FROM_PTP_1588")

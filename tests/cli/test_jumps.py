@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from tests.builders.bags import Body, Recorded, transforms_message
+from tests.builders.mcaps import write_mcap
 from tests.builders.points import OUSTER, STAMP_NS, cloud_message, write_points
 from tests.builders.sessions import (
     EPOCH_NS,
@@ -20,7 +21,7 @@ from tests.builders.sessions import (
     twin,
     write_session,
 )
-from tests.builders.sessions_of_bags import unit_messages, write_mcap
+from tests.builders.sessions_of_bags import unit_messages
 
 TURN_NS = 100 * NS_PER_MS
 

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tests.builders.mcaps import write_mcap
 from tests.builders.sessions import (
     EPOCH_NS,
     FIXTURE,
@@ -25,7 +26,7 @@ from tests.builders.sessions import (
     twin,
     write_session,
 )
-from tests.builders.sessions_of_bags import unit_messages, write_mcap
+from tests.builders.sessions_of_bags import unit_messages
 
 CAPTURE = FIXTURE / "two_lidars.pcap"
 FIX = f"{CAPTURE} --rig {FIXTURE / 'rig.yaml'}"

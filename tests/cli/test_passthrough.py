@@ -16,8 +16,9 @@ from mlbatch.pipeline.conversion import Conversion, SkippedWindow
 from mlbatch.pipeline.job import Job
 from mlbatch.types import MESSAGE_ENCODINGS
 from tests.builders.bags import Body, Recorded
+from tests.builders.mcaps import write_mcap
 from tests.builders.sessions import NS_PER_MS, Shell, Unit, twin
-from tests.builders.sessions_of_bags import unit_messages, write_mcap
+from tests.builders.sessions_of_bags import unit_messages
 
 # Longer than what rates are measured over.
 TURNS = 24

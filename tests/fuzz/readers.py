@@ -192,16 +192,13 @@ def _file(write: Callable[[Path], object], suffix: str) -> bytes:
 
 @lru_cache(maxsize=1)
 def _mcaps() -> Seeds:
-    packets = mcaps.fixture_packets()[:12]
-    small = [packet for packet in packets if len(packet.payload) < 400][:6]
-    forms = [*mcaps.FORMS.values(), mcaps.Form(chunk_bytes=500, qos={"offered_qos_profiles": "-"})]
+    forms = [*mcaps.FORMS.values(), mcaps.Form(chunk_bytes=500)]
     seeds = []
     for number, form in enumerate(forms):
-        sent = mcaps.packet_messages(packets if number < 2 else small or packets[:3], form.ros)
-        text = mcaps.Sent(
-            "/left/metadata", "std_msgs/String", sent[0].log_ns, mcaps.text_message("{}", form.ros)
-        )
-        write = partial(mcaps.write_mcap, sent=[text, *sent], form=form)
+        messages = _messages(form.encoding)
+        small = [message for message in messages if len(message.data) < 3000]
+        sent = messages if number < 2 else small
+        write = partial(mcaps.write_mcap, messages=sent, form=form)
         seeds.append(_file(write, ".mcap"))
     return tuple(seeds)
 

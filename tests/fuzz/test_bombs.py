@@ -18,9 +18,8 @@ from mlbatch.errors import MlbatchError, RigError
 from mlbatch.readers import open_recording
 from mlbatch.rig.rig import read_rig
 from mlbatch.types import Recording, StreamTable
-from tests.builders.bags import Recorded
+from tests.builders.bags import Recorded, packet_message
 from tests.builders.captures import Section, pcap_bytes, section_bytes
-from tests.builders.mcaps import CDR_HEAD
 from tests.builders.rosbag2 import Form, write_rosbag2
 from tests.fuzz import readers
 from tests.fuzz.harness import MOST_BYTES, Tally, Target, campaign
@@ -197,7 +196,7 @@ def test_an_mcap_that_names_very_many_topics_takes_seconds() -> None:
         topic, encoding = b"/%d/lidar_packets" % number, b"cdr"
         body = struct.pack("<HH", number, 1) + struct.pack("<I", len(topic)) + topic
         parts.append((4, body + struct.pack("<I", len(encoding)) + encoding + bytes(4)))
-    message = struct.pack("<HIQQ", 64_999, 0, 10**18, 10**18) + CDR_HEAD + struct.pack("<I", 0)
+    message = struct.pack("<HIQQ", 64_999, 0, 10**18, 10**18) + packet_message("cdr", b"")
     parts.append((5, message))
     data = _MAGIC + b"".join(struct.pack("<BQ", op, len(body)) + body for op, body in parts)
     _sound(_examined(data, partial(_read)))

@@ -15,11 +15,12 @@ import numpy as np
 from tests.builders import livox
 from tests.builders.bags import Recorded
 from tests.builders.captures import Packet, Section, udp_frame, write_pcap, write_pcapng
+from tests.builders.mcaps import write_mcap
 from tests.builders.messages import Unit, merged, messages
 from tests.builders.points import OUSTER, STAMP_NS, Form, cloud_message, write_points
 from tests.builders.rosbag1 import write_rosbag1
 from tests.builders.rosbag2 import write_rosbag2
-from tests.builders.sessions_of_bags import packets_only, told, write_mcap
+from tests.builders.sessions_of_bags import packets_only, told
 from tests.builders.traffic import Datagram, datagrams_of, read_pcap
 from tests.matrix.containers import CONTAINERS as MATRIX_CONTAINERS
 from tests.matrix.containers import SCAN_NS, rig_text

@@ -17,6 +17,7 @@ from mcap.reader import make_reader
 from mlbatch.rig.rig import read_rig
 from mlbatch.simulate.ouster.encode import metadata_json
 from tests.builders.bags import Recorded, imu_message
+from tests.builders.mcaps import write_mcap
 from tests.builders.rosbag1 import write_rosbag1
 from tests.builders.rosbag2 import Form, write_folder, write_rosbag2
 from tests.builders.run import TWO_LIDARS, Told, command, load, scan_files
@@ -27,7 +28,6 @@ from tests.builders.sessions_of_bags import (
     told,
     unit_messages,
     urdf,
-    write_mcap,
 )
 from tests.builders.two_lidars import LEFT, RIGHT, body_from_sensor
 

@@ -15,10 +15,10 @@ from mlbatch import ros
 from mlbatch.types import Topic
 from mlbatch.verification import Verdict, verify
 from tests.builders.bags import Body, Recorded, fixture_messages, transforms_message
+from tests.builders.mcaps import write_mcap
 from tests.builders.rewritten_outputs import Sent, mcap, only
 from tests.builders.run import TWO_LIDARS, command
 from tests.builders.sessions import SMALL, Shell, Unit, write_session
-from tests.builders.sessions_of_bags import write_mcap
 from tests.builders.written_bags import Read, read_back
 
 OUTPUTS = {"mcap": "scans.mcap", "rosbag1": "scans.bag", "rosbag2": "scans"}

@@ -27,9 +27,9 @@ from mlbatch.simulate.robosense.encode import (
 )
 from tests.builders.bags import Recorded
 from tests.builders.lidar_packets import Payloads
+from tests.builders.mcaps import write_mcap
 from tests.builders.rosbag2 import Form, write_rosbag2
 from tests.builders.run import in_memory
-from tests.builders.sessions_of_bags import write_mcap
 from tests.builders.vendor_sessions import robosense_scan
 
 UNIT = RobosenseSpec("Helios 32, early type", start_deg=17.3)

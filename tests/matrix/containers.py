@@ -13,10 +13,10 @@ import numpy as np
 
 from tests.builders.bags import Recorded
 from tests.builders.captures import Packet, Section, udp_frame, write_pcap, write_pcapng
+from tests.builders.mcaps import write_mcap
 from tests.builders.messages import Unit, merged, messages
 from tests.builders.rosbag1 import write_rosbag1
 from tests.builders.rosbag2 import write_rosbag2
-from tests.builders.sessions_of_bags import write_mcap
 from tests.matrix.lidars import VENDORS, Sent
 
 # Scan messages contain the packets of so many ns, less than the shortest wait of the matrix.

@@ -8,8 +8,9 @@ from __future__ import annotations
 
 import random
 import tempfile
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -21,11 +22,7 @@ from mcap.writer import IndexType
 from mlbatch.arrays import I64Array, U8Array
 from mlbatch.readers.byte_records import SLACK
 from mlbatch.readers.capture.recording import CaptureRecording
-from mlbatch.readers.formats import mcap, pcap, pcapng, rosbag1, rosbag2
-from mlbatch.types import Recording, StreamTable
-from tests.builders import mcaps
-from tests.builders.bags import OUSTER_ROS1, Recorded
-from tests.builders.bags import packet_message as message_of
+from tests.builders.bags import OUSTER_ROS1, Recorded, packet_message
 from tests.builders.captures import (
     Interface,
     Packet,
@@ -35,10 +32,12 @@ from tests.builders.captures import (
     write_pcap,
     write_pcapng,
 )
-from tests.builders.reading import Seen, assert_balanced, seen_of
+from tests.builders.mcaps import LZ4, Form, write_mcap
+from tests.builders.reading import open_bag, open_capture, read
 from tests.builders.rosbag1 import write_rosbag1
 from tests.builders.rosbag2 import write_rosbag2
 
+OUSTER = "ouster_sensor_msgs/PacketMsg"
 T0_NS = 1_700_000_000_000_000_000
 _ETHERNET_HEADERS = 42
 _RECORD_BYTES = 16
@@ -53,101 +52,56 @@ _ALL_BYTES = 30
 _MOST_OF_BAGS = 600
 
 
-@dataclass(frozen=True, slots=True)
-class Format:
-    """A kind of file; write: payloads at times in ns; opened: with buffers of that many bytes."""
-
-    write: Callable[[Path, Sequence[tuple[int, bytes]]], object]
-    opened: Callable[[Path, int], Recording]
+Packets = Sequence[tuple[int, bytes]]
 
 
-def _frames(packets: Sequence[tuple[int, bytes]]) -> list[tuple[int, bytes]]:
+def _frames(packets: Packets) -> list[tuple[int, bytes]]:
     return [(at_ns, udp_frame(payload)[0]) for at_ns, payload in packets]
 
 
-def _write_pcapng(path: Path, packets: Sequence[tuple[int, bytes]], big_endian: bool) -> None:
+def _recorded(packets: Packets, kind: str, encoding: str) -> list[Recorded]:
+    return [
+        Recorded("/lidar_packets", kind, at_ns, packet_message(encoding, payload))
+        for at_ns, payload in packets
+    ]
+
+
+def _pcap(path: Path, packets: Packets, big_endian: bool = False) -> None:
+    write_pcap(path, _frames(packets), big_endian=big_endian)
+
+
+def _pcapng(path: Path, packets: Packets, big_endian: bool = False) -> None:
     blocks = [Packet(frame, at_ns) for at_ns, frame in _frames(packets)]
     write_pcapng(path, [Section(blocks, [Interface()], big_endian=big_endian)])
 
 
-def _write_mcap(path: Path, packets: Sequence[tuple[int, bytes]], form: mcaps.Form) -> None:
-    sent = [
-        mcaps.Sent("/lidar_packets", mcaps.OUSTER, at_ns, mcaps.packet_message(payload))
-        for at_ns, payload in packets
-    ]
-    mcaps.write_mcap(path, sent, form)
+def _mcap(path: Path, packets: Packets, form: Form) -> None:
+    write_mcap(path, _recorded(packets, OUSTER, "cdr"), form)
 
 
-def _recorded(packets: Sequence[tuple[int, bytes]], kind: str, encoding: str) -> list[Recorded]:
-    return [
-        Recorded("/lidar_packets", kind, at_ns, message_of(encoding, payload))
-        for at_ns, payload in packets
-    ]
-
-
-def _write_rosbag1(path: Path, packets: Sequence[tuple[int, bytes]], compression: str) -> None:
+def _rosbag1(path: Path, packets: Packets, compression: str = "none") -> None:
     write_rosbag1(path, _recorded(packets, OUSTER_ROS1, "ros1"), compression, chunk_bytes=700)
 
 
-def _capture(opener: Callable[[Path, StreamTable], Recording]) -> Callable[[Path, int], Recording]:
-    def opened(path: Path, buffer_bytes: int) -> Recording:
-        recording = opener(path, StreamTable())
-        assert isinstance(recording, CaptureRecording)
-        recording.buffer_bytes = buffer_bytes
-        return recording
-
-    return opened
+def _rosbag2(path: Path, packets: Packets) -> None:
+    write_rosbag2(path, _recorded(packets, OUSTER, "cdr"))
 
 
-def _open_mcap(path: Path, buffer_bytes: int) -> Recording:
-    return mcap.open_folder(path, [path], StreamTable(), buffer_bytes=buffer_bytes)
-
-
-def _open_rosbag1(path: Path, buffer_bytes: int) -> Recording:
-    return rosbag1.open_packets(path, StreamTable(), buffer_bytes=buffer_bytes)
-
-
-def _open_rosbag2(path: Path, buffer_bytes: int) -> Recording:
-    return rosbag2.open_folder(path, [path], StreamTable(), buffer_bytes=buffer_bytes)
-
-
-def _mcap(form: mcaps.Form) -> Format:
-    return Format(lambda path, packets: _write_mcap(path, packets, form), _open_mcap)
-
-
-def _pcap(*, big_endian: bool = False) -> Format:
-    return Format(
-        lambda path, packets: write_pcap(path, _frames(packets), big_endian=big_endian),
-        _capture(pcap.open_packets),
-    )
-
-
-def _pcapng(*, big_endian: bool = False) -> Format:
-    return Format(
-        lambda path, packets: _write_pcapng(path, packets, big_endian),
-        _capture(pcapng.open_packets),
-    )
-
-
-def _rosbag1(compression: str) -> Format:
-    return Format(lambda path, packets: _write_rosbag1(path, packets, compression), _open_rosbag1)
-
-
-FORMATS = {
-    "pcap": _pcap(),
-    "pcap, big endian": _pcap(big_endian=True),
-    "pcapng": _pcapng(),
-    "pcapng, big endian": _pcapng(big_endian=True),
-    "MCAP": _mcap(mcaps.Form(chunk_bytes=700)),
-    "MCAP without chunks": _mcap(mcaps.Form(chunked=False)),
-    "MCAP, lz4": _mcap(mcaps.Form(mcaps.LZ4, chunk_bytes=700)),
-    "MCAP without index": _mcap(mcaps.Form(chunk_bytes=700, index=IndexType.NONE, repeat=False)),
-    "ROS 1 bag": _rosbag1("none"),
-    "ROS 1 bag, lz4": _rosbag1("lz4"),
-    "ROS 2 bag": Format(
-        lambda path, packets: write_rosbag2(path, _recorded(packets, mcaps.OUSTER, "cdr")),
-        _open_rosbag2,
+# Kinds of files, written of payloads at times in ns.
+FORMATS: Mapping[str, Callable[[Path, Packets], object]] = {
+    "pcap": _pcap,
+    "pcap, big endian": partial(_pcap, big_endian=True),
+    "pcapng": _pcapng,
+    "pcapng, big endian": partial(_pcapng, big_endian=True),
+    "MCAP": partial(_mcap, form=Form(chunk_bytes=700)),
+    "MCAP without chunks": partial(_mcap, form=Form(chunked=False)),
+    "MCAP, lz4": partial(_mcap, form=Form(compression=LZ4, chunk_bytes=700)),
+    "MCAP without index": partial(
+        _mcap, form=Form(chunk_bytes=700, index=IndexType.NONE, repeat=False)
     ),
+    "ROS 1 bag": _rosbag1,
+    "ROS 1 bag, lz4": partial(_rosbag1, compression="lz4"),
+    "ROS 2 bag": _rosbag2,
 }
 _EACH = pytest.mark.parametrize("name", FORMATS)
 
@@ -159,13 +113,11 @@ def packets_of(rows: Sequence[tuple[int, int]]) -> list[tuple[int, bytes]]:
     return [(T0_NS + 1_001 * number, pick.randbytes(size)) for number, size in enumerate(sizes)]
 
 
-def packets_read(recording: Recording) -> list[tuple[int, bytes]]:
+def packets_read(name: str, path: Path, buffer_bytes: int) -> list[tuple[int, bytes]]:
     """Receive times and payloads of all packets; the ledger must balance, without notes."""
-    streams: StreamTable = recording.streams  # type: ignore[attr-defined]
-    seen: list[Seen] = []
-    for batch in recording.packets():
-        seen += seen_of(batch, streams)
-    assert_balanced(recording)
+    opened = open_capture if "pcap" in name else open_bag
+    recording = opened(path, buffer_bytes=buffer_bytes)
+    seen = read(recording)
     assert recording.notes == []
     assert not recording.counts.skipped
     assert recording.counts.datagrams == len(seen)
@@ -186,10 +138,10 @@ def test_the_first_buffer_may_end_at_every_byte(tmp_path: Path, name: str) -> No
     rows = [(1, 9), (19, _LONG), (2, 7)] if "pcap" in name else [(2, 9), (6, 4), (1, 7), (5, 4)]
     packets = packets_of(rows)
     path = tmp_path / "recording"
-    FORMATS[name].write(path, packets)
+    FORMATS[name](path, packets)
     for buffer_bytes in _sizes(name, path.stat().st_size):
-        assert packets_read(FORMATS[name].opened(path, buffer_bytes)) == packets, buffer_bytes
-    assert packets_read(FORMATS[name].opened(path, 1 << 22)) == packets
+        assert packets_read(name, path, buffer_bytes) == packets, buffer_bytes
+    assert packets_read(name, path, 1 << 22) == packets
 
 
 @pytest.mark.parametrize("big_endian", [False, True])
@@ -202,8 +154,7 @@ def test_rows_of_any_length_end_at_every_byte_of_the_frames_around(
         packets = packets_of([(2, 3), (length, _LONG), (1, 9), (2, 11)])
         content = pcap_bytes(_frames(packets), big_endian=big_endian)
         path.write_bytes(content)
-        recording = pcap.open_packets(path, StreamTable())
-        assert isinstance(recording, CaptureRecording)
+        recording = open_capture(path)
         sizes = [len(payload) + _ETHERNET_HEADERS + _RECORD_BYTES for _, payload in packets]
         after = np.cumsum([_FILE_HEADER_BYTES, *sizes])
         file = _File(recording, np.frombuffer(content + bytes(SLACK), np.uint8), after)
@@ -249,6 +200,6 @@ def test_any_rows_and_any_buffer(name: str, rows: list[tuple[int, int]], buffer_
     packets = packets_of(rows)
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "recording"
-        FORMATS[name].write(path, packets)
-        assert packets_read(FORMATS[name].opened(path, buffer_bytes)) == packets
-        assert packets_read(FORMATS[name].opened(path, 1 << 22)) == packets
+        FORMATS[name](path, packets)
+        assert packets_read(name, path, buffer_bytes) == packets
+        assert packets_read(name, path, 1 << 22) == packets

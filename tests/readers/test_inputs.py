@@ -9,8 +9,9 @@ import pytest
 
 from mlbatch.errors import RecordingError
 from mlbatch.readers.inputs import expand
+from tests.builders.mcaps import write_mcap
 from tests.builders.sessions import FIXTURE, Shell, Unit, report_of, twin, write_session
-from tests.builders.sessions_of_bags import unit_messages, write_mcap
+from tests.builders.sessions_of_bags import unit_messages
 
 CAPTURE = FIXTURE / "two_lidars.pcap"
 

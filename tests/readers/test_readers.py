@@ -5,7 +5,7 @@ from __future__ import annotations
 import gzip
 import os
 import random
-from collections.abc import Callable
+from collections.abc import Generator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
 from pathlib import Path
@@ -13,84 +13,58 @@ from pathlib import Path
 import pytest
 import zstandard
 
-from mlbatch.errors import RecordingError
-from mlbatch.readers import merge, open_recording, readers
+from mlbatch.readers import merge, open_recording
 from mlbatch.readers.formats import rosbag2
-from mlbatch.readers.source import Source
-from mlbatch.types import CutOff, Recording, StreamTable, WrappedRecording
+from mlbatch.types import CutOff, PacketBatch, StreamTable, WrappedRecording
 from tests.builders.bags import fixture_messages
 from tests.builders.captures import Packet, Section, pcap_bytes, section_bytes, udp_frame
-from tests.builders.reading import open_capture, read
+from tests.builders.reading import open_capture, read, refusal
 from tests.builders.rosbag2 import write_rosbag2
 from tests.builders.sessions_of_bags import CONTAINERS
 
 CONTENT = pcap_bytes((i, udp_frame(random.Random(i).randbytes(1000))[0]) for i in range(300))
 
 
-def zstd(data: bytes) -> bytes:
-    """One zstd frame."""
-    return zstandard.ZstdCompressor().compress(data)
-
-
-def refusal(path: Path) -> str:
-    """The one line that says why `path` cannot be opened."""
-    with pytest.raises(RecordingError) as caught:
-        open_recording(path, StreamTable())
-    message = str(caught.value)
-    assert message.startswith(f"{path}: ")
-    assert "\n" not in message
-    return message
-
-
-def test_both_capture_formats_are_found() -> None:
-    assert {"pcap", "pcapng"} <= {reader.CONTAINER for reader in readers()}
-
-
-@pytest.mark.parametrize("squeeze", [gzip.compress, zstd])
-def test_compressed_captures_read_as_plain_ones(tmp_path: Path, squeeze: object) -> None:
-    assert callable(squeeze)
-    plain, packed = tmp_path / "plain.bin", tmp_path / "packed.pcap"
-    plain.write_bytes(CONTENT)
-    packed.write_bytes(squeeze(CONTENT))
-    recording = open_capture(packed, buffer_bytes=5000)
-    assert read(recording) == read(open_capture(plain))
-    assert recording.size_bytes == packed.stat().st_size == recording.position_bytes
-
-
-@pytest.mark.parametrize("squeeze", [gzip.compress, zstd])
-def test_several_members_are_one_stream(tmp_path: Path, squeeze: object) -> None:
-    assert callable(squeeze)
-    (tmp_path / "a").write_bytes(squeeze(CONTENT[:7777]) + squeeze(CONTENT[7777:]))
-    assert len(read(open_capture(tmp_path / "a"))) == 300
-
-
-def test_padding_after_gzip_data_is_ignored(tmp_path: Path) -> None:
-    (tmp_path / "a").write_bytes(gzip.compress(CONTENT) + bytes(512))
-    recording = open_capture(tmp_path / "a")
-    assert len(read(recording)) == 300
-    assert recording.notes == []
-
-
-@pytest.mark.parametrize("squeeze", [gzip.compress, zstd])
-def test_cut_off_compressed_data_give_what_is_whole(tmp_path: Path, squeeze: object) -> None:
-    assert callable(squeeze)
-    packed = squeeze(CONTENT)
-    (tmp_path / "a").write_bytes(packed[: len(packed) // 2])
-    recording = open_capture(tmp_path / "a", buffer_bytes=4000)
-    seen = read(recording)
-    assert 50 < len(seen) < 200
-    assert [one.host_ns for one in seen] == list(range(len(seen)))
-    assert recording.notes
-
-
-def test_corrupt_compressed_data_end_the_reading(tmp_path: Path) -> None:
+def _corrupt() -> bytes:
+    """The head of the second stored block (RFC 1951, 3.2.4): a kind that does not exist."""
     packed = bytearray(gzip.compress(CONTENT, 0))
-    # The head of the second stored block (RFC 1951, 3.2.4): a kind that does not exist.
     packed[10 + 5 + 65_535] = 0xFF
-    (tmp_path / "a").write_bytes(packed)
-    recording = open_capture(tmp_path / "a", buffer_bytes=4000)
-    assert len(read(recording)) < 300
-    assert "corrupt or cut-off compressed data" in recording.notes[0]
+    return bytes(packed)
+
+
+def _half(packed: bytes) -> bytes:
+    return packed[: len(packed) // 2]
+
+
+FAULT = "corrupt or cut-off compressed data"
+# Content, and what is said of it if it is not whole.
+COMPRESSED: Mapping[str, tuple[bytes, str]] = {
+    "gzip": (gzip.compress(CONTENT), ""),
+    "zstd": (zstandard.compress(CONTENT), ""),
+    "gzip, members": (gzip.compress(CONTENT[:7777]) + gzip.compress(CONTENT[7777:]), ""),
+    "zstd, frames": (zstandard.compress(CONTENT[:7777]) + zstandard.compress(CONTENT[7777:]), ""),
+    "gzip, padding": (gzip.compress(CONTENT) + bytes(512), ""),
+    "gzip, cut": (_half(gzip.compress(CONTENT)), FAULT),
+    "zstd, cut": (_half(zstandard.compress(CONTENT)), "the file ends within a record"),
+    "gzip, corrupt": (_corrupt(), FAULT),
+}
+
+
+@pytest.mark.parametrize("name", COMPRESSED)
+def test_compressed_captures_read_as_plain_ones(tmp_path: Path, name: str) -> None:
+    content, fault = COMPRESSED[name]
+    (tmp_path / "plain.bin").write_bytes(CONTENT)
+    (tmp_path / "packed.pcap").write_bytes(content)
+    recording = open_capture(tmp_path / "packed.pcap", buffer_bytes=4000)
+    expected, seen = read(open_capture(tmp_path / "plain.bin")), read(recording)
+    assert seen == expected[: len(seen)]
+    if fault:
+        assert 50 < len(seen) < 200
+        assert fault in recording.notes[0]
+    else:
+        assert len(seen) == 300
+        assert recording.notes == []
+        assert recording.size_bytes == len(content) == recording.position_bytes
 
 
 @pytest.mark.parametrize("name", CONTAINERS)
@@ -111,11 +85,6 @@ def test_a_recording_that_ends_early_is_cut_off(tmp_path: Path, name: str) -> No
         assert bool(ends) == (not is_whole or "cut off" in name), recording.notes
 
 
-def test_compressed_data_without_a_beginning(tmp_path: Path) -> None:
-    (tmp_path / "a").write_bytes(gzip.compress(CONTENT)[:12])
-    assert "compressed data" in refusal(tmp_path / "a")
-
-
 def test_content_decides_not_the_name(tmp_path: Path) -> None:
     frame = udp_frame(b"x")[0]
     (tmp_path / "a.pcap").write_bytes(section_bytes(Section([Packet(frame)])))
@@ -125,100 +94,53 @@ def test_content_decides_not_the_name(tmp_path: Path) -> None:
     assert [recording.container for recording in opened] == ["pcapng", "pcap"]
 
 
-def test_files_that_are_no_recordings(tmp_path: Path) -> None:
-    assert "no such file" in refusal(tmp_path / "missing.pcap")
-    assert "folder" in refusal(tmp_path)
-    (tmp_path / "empty").write_bytes(b"")
-    assert "0 bytes" in refusal(tmp_path / "empty")
-    (tmp_path / "text").write_bytes(b"hello, world")
-    message = refusal(tmp_path / "text")
-    assert "68 65 6c 6c 6f 2c 20 77" in message
-    assert "pcap, pcapng" in message
-    (tmp_path / "short").write_bytes(CONTENT[:10])
-    assert "found 10" in refusal(tmp_path / "short")
+def test_what_is_no_file_or_may_not_be_read(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     os.mkfifo(tmp_path / "pipe")
     assert "regular file" in refusal(tmp_path / "pipe")
-
-
-@pytest.mark.skipif(os.geteuid() == 0, reason="root may read everything")
-def test_no_permission(tmp_path: Path) -> None:
-    (tmp_path / "a").write_bytes(CONTENT)
-    (tmp_path / "a").chmod(0)
-    assert "no permission" in refusal(tmp_path / "a")
-
-
-def test_permission_errors_say_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "a").write_bytes(CONTENT)
 
     def refuse(*_: object, **__: object) -> None:
         raise PermissionError(13, "Permission denied")
 
+    # The modes of files do not stop root.
     monkeypatch.setattr(Path, "open", refuse)
     assert "no permission" in refusal(tmp_path / "a")
 
 
-def test_a_bomb_is_read_in_bounded_pieces(tmp_path: Path) -> None:
-    (tmp_path / "a").write_bytes(zstd(bytes(50_000_000)))
-    piece = memoryview(bytearray(1000))
-    with Source(tmp_path / "a") as source:
-        assert source.fill(piece) == 1000
-        assert source.size_bytes < 10_000
-
-
-def _bags(folder: Path, count: int) -> list[Path]:
+@pytest.mark.parametrize("bags", [1, 3])
+def test_another_thread_goes_on_or_ends(bags: int, tmp_path: Path) -> None:
+    """Errors at the end of objects are failures of tests (see pyproject.toml)."""
     messages = fixture_messages("cdr")
-    step = len(messages) // count
-    return [
-        write_rosbag2(folder / f"{number}.db3", messages[number * step : (number + 1) * step])
-        for number in range(count)
+    step = len(messages) // bags
+    paths = [
+        write_rosbag2(tmp_path / f"{number}.db3", messages[number * step : (number + 1) * step])
+        for number in range(bags)
     ]
 
-
-@pytest.fixture
-def elsewhere() -> Callable[[Callable[[], object]], object]:
-    """What a function gives in a thread of its own."""
-
-    def run(what: Callable[[], object]) -> object:
-        with ThreadPoolExecutor(1) as pool:
-            return pool.submit(what).result()
-
-    return run
-
-
-@pytest.mark.parametrize("bags", [1, 3])
-def test_another_thread_goes_on(
-    bags: int,
-    tmp_path: Path,
-    elsewhere: Callable[[Callable[[], object]], object],
-) -> None:
-    paths = _bags(tmp_path, bags)
-
-    def opened() -> list[Recording]:
+    def batches(*paths: Path) -> Generator[PacketBatch, None, None]:
         # Several batches a file.
-        return [
-            rosbag2.open_folder(path, [path], StreamTable(), buffer_bytes=1 << 16) for path in paths
-        ]
+        return merge(
+            [
+                rosbag2.open_folder(path, [path], StreamTable(), buffer_bytes=1 << 16)
+                for path in paths
+            ]
+        )
 
-    whole = [len(batch) for batch in merge(opened())]
-    batches = merge(opened())
-    counts = [len(next(batches))]
-    rest = elsewhere(lambda: [len(batch) for batch in batches])
-    assert isinstance(rest, list)
-    assert counts + rest == whole
-    assert len(whole) > 1 or bags == 1
-
-
-@pytest.mark.parametrize("bags", [1, 3])
-def test_another_thread_ends(
-    bags: int, tmp_path: Path, elsewhere: Callable[[Callable[[], object]], object]
-) -> None:
-    """Errors at the end of objects are failures of tests (see pyproject.toml)."""
-    streams = StreamTable()
-    batches = merge([open_recording(path, streams) for path in _bags(tmp_path, bags)])
-    next(batches)
-    elsewhere(batches.close)
-    assert next(batches, None) is None
-    with closing(merge([open_recording(tmp_path / "0.db3", streams)])) as again:
+    whole = [len(batch) for batch in batches(*paths)]
+    begun = batches(*paths)
+    first = len(next(begun))
+    with ThreadPoolExecutor(1) as thread:
+        rest = thread.submit(lambda: [len(batch) for batch in begun]).result()
+    assert [first, *rest] == whole
+    assert len(whole) > 1
+    begun = batches(*paths)
+    next(begun)
+    with ThreadPoolExecutor(1) as thread:
+        thread.submit(begun.close).result()
+    assert next(begun, None) is None
+    with closing(batches(paths[0])) as again:
         assert len(next(again))
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import random
+from collections.abc import Mapping
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -50,12 +51,6 @@ def seen_and_skipped(
         return seen, lost
 
 
-def found(frames: list[bytes]) -> tuple[list[bytes], dict[str, int]]:
-    """Payloads and skipped frames of frames received 1 us apart."""
-    seen, skipped = seen_and_skipped([(i * 1000, frame) for i, frame in enumerate(frames)])
-    return [one.payload for one in seen], skipped
-
-
 def test_the_completing_fragment_gives_the_time() -> None:
     first, middle, last = fragments(1)
     seen, skipped = seen_and_skipped([(10, first), (30, last), (70, middle)])
@@ -63,114 +58,116 @@ def test_the_completing_fragment_gives_the_time() -> None:
     assert skipped == {"fragment": 2}
 
 
-@pytest.mark.parametrize("order", [(0, 1, 2), (2, 1, 0), (1, 2, 0), (1, 0, 2)])
-def test_order_within_a_datagram_does_not_matter(order: tuple[int, ...]) -> None:
-    frames = fragments(1)
-    assert found([frames[i] for i in order]) == ([payload(1)], {"fragment": 2})
+def mixed(*datagrams: list[bytes]) -> list[bytes]:
+    """Frames of datagrams in turn."""
+    return [frame for frames in zip(*datagrams, strict=True) for frame in frames]
 
 
-def test_sensors_interleave() -> None:
-    one, two = fragments(1, src="10.0.0.1"), fragments(2, src="10.0.0.2")
-    mixed = [frame for pair in zip(one, two, strict=True) for frame in pair]
-    assert found(mixed) == ([payload(1), payload(2)], {"fragment": 4})
-
-
-def test_plain_and_fragmented_packets_keep_the_order_of_completion() -> None:
-    first, middle, last = fragments(1)
-    (plain,), (later,) = udp_frame(b"plain"), udp_frame(b"later")
-    expected = [b"plain", payload(1), b"later"]
-    assert found([first, plain, middle, last, later])[0] == expected
-
-
-def test_repeated_fragments_change_nothing() -> None:
-    first, middle, last = fragments(1)
-    frames = [first, first, middle, first, middle, last]
-    assert found(frames) == ([payload(1)], {"fragment": 5})
-
-
-def test_a_new_first_fragment_starts_over() -> None:
-    old, new = fragments(1), fragments(2)
-    assert found([*old[:2], *new]) == ([payload(2)], {"fragment_lost": 2, "fragment": 2})
-
-
-def test_an_identification_is_used_again_at_once() -> None:
-    frames = [*fragments(1), *fragments(2), *fragments(3)]
-    assert found(frames) == ([payload(1), payload(2), payload(3)], {"fragment": 6})
-
-
-def test_a_lost_fragment_loses_its_datagram_only() -> None:
-    broken = fragments(1, ident=1)
-    frames = [broken[0], *fragments(2, ident=2), broken[2], *fragments(3, ident=3)]
-    expected = {"fragment": 4, "fragment_lost": 2}
-    assert found(frames) == ([payload(2), payload(3)], expected)
-
-
-@pytest.mark.parametrize(("age_ns", "whole"), [(SECOND_NS, True), (SECOND_NS + 1, False)])
-def test_sets_older_than_a_second_are_dropped(age_ns: int, whole: bool) -> None:
-    first, middle, last = fragments(1)
-    seen, skipped = seen_and_skipped([(5, first), (5 + age_ns, middle), (5 + age_ns, last)])
-    assert len(seen) == whole
-    assert skipped == ({"fragment": 2} if whole else {"fragment_lost": 3})
-
-
-def test_age_counts_when_the_clock_steps_back() -> None:
-    first, middle, last = fragments(1)
-    seen, skipped = seen_and_skipped(
-        [(5 * SECOND_NS, first), (SECOND_NS, middle), (SECOND_NS, last)]
+def piece(data: bytes, offset: int = 0, *, more: bool, protocol: int = 17) -> bytes:
+    """A fragment of the sender and identification of `fragments(1)`."""
+    return link_frame(
+        ipv4_packet(data, "10.0.0.1", "10.0.0.2", offset=offset, more=more, protocol=protocol)
     )
-    assert (seen, skipped) == ([], {"fragment_lost": 3})
+
+
+def of_length(length: int) -> list[bytes]:
+    """Fragments of 1010 bytes whose UDP header states another length."""
+    udp = (7).to_bytes(2, "big") * 2 + length.to_bytes(2, "big") + bytes(1002)
+    return [piece(udp[:504], more=True), piece(udp[504:], 504, more=False)]
+
+
+FIRST, MIDDLE, LAST = fragments(1)
+(PLAIN,), (LATER,) = udp_frame(b"plain"), udp_frame(b"later")
+# Frames, and the payloads and skipped frames that they give.
+RULES: Mapping[str, tuple[list[bytes], list[bytes], dict[str, int]]] = {
+    **{
+        f"order {order}": ([fragments(1)[at] for at in order], [payload(1)], {"fragment": 2})
+        for order in ((0, 1, 2), (2, 1, 0), (1, 2, 0), (1, 0, 2))
+    },
+    "sensors interleave": (
+        mixed(fragments(1, src="10.0.0.1"), fragments(2, src="10.0.0.2")),
+        [payload(1), payload(2)],
+        {"fragment": 4},
+    ),
+    "destinations keep sets apart": (
+        mixed(*(udp_frame(payload(i), "10.0.0.1", f"10.0.1.{i}", mtu=MTU) for i in (1, 2))),
+        [payload(1), payload(2)],
+        {"fragment": 4},
+    ),
+    "IPv6 and IPv4 interleave": (
+        mixed(udp_frame(payload(6), "fe80::1", "fe80::2", mtu=600), fragments(4)),
+        [payload(6), payload(4)],
+        {"fragment": 4},
+    ),
+    "the order is that of completion": (
+        [FIRST, PLAIN, MIDDLE, LAST, LATER],
+        [b"plain", payload(1), b"later"],
+        {"fragment": 2},
+    ),
+    "repeated fragments change nothing": (
+        [FIRST, FIRST, MIDDLE, FIRST, MIDDLE, LAST],
+        [payload(1)],
+        {"fragment": 5},
+    ),
+    "a new first fragment starts over": (
+        [FIRST, MIDDLE, *fragments(2)],
+        [payload(2)],
+        {"fragment_lost": 2, "fragment": 2},
+    ),
+    "an identification is used again at once": (
+        [*fragments(1), *fragments(2), *fragments(3)],
+        [payload(1), payload(2), payload(3)],
+        {"fragment": 6},
+    ),
+    "a lost fragment loses its datagram only": (
+        [FIRST, *fragments(2, ident=2), LAST, *fragments(3, ident=3)],
+        [payload(2), payload(3)],
+        {"fragment": 4, "fragment_lost": 2},
+    ),
+    **{
+        f"contradiction at {offset}": (
+            [FIRST, MIDDLE, piece(bytes(size), offset, more=more), LAST],
+            [],
+            {"fragment_lost": 4},
+        )
+        for offset, size, more in (
+            *((544, 552, True), (552, 544, True)),
+            *((1656, 8, True), (552, 100, False)),
+        )
+    },
+    "beyond the largest datagram": (
+        [FIRST, piece(bytes(1000), 65000, more=False)],
+        [],
+        {"fragment_lost": 2},
+    ),
+    "shorter than its UDP length": (of_length(3000), [], {"fragment_lost": 2}),
+    "longer than its UDP length": (of_length(600), [bytes(592)], {"fragment": 1}),
+    "another protocol": ([piece(bytes(800), more=True, protocol=6)], [], {"not_udp": 1}),
+}
+
+
+@pytest.mark.parametrize("name", RULES)
+def test_rules_of_reassembly(name: str) -> None:
+    frames, payloads, skipped = RULES[name]
+    seen, found = seen_and_skipped([(i * 1000, frame) for i, frame in enumerate(frames)])
+    assert ([one.payload for one in seen], found) == (payloads, skipped)
 
 
 @pytest.mark.parametrize(
-    ("offset", "size", "more"),
-    [(544, 552, True), (552, 544, True), (1656, 8, True), (552, 100, False)],
+    ("begin_ns", "next_ns", "skipped"),
+    [
+        (5, 5 + SECOND_NS, {"fragment": 2}),
+        (5, 6 + SECOND_NS, {"fragment_lost": 3}),
+        # Also where the clock steps back.
+        (5 * SECOND_NS, SECOND_NS, {"fragment_lost": 3}),
+    ],
 )
-def test_fragments_that_contradict_drop_the_set(offset: int, size: int, more: bool) -> None:
-    first, middle, last = fragments(1)
-    packet = ipv4_packet(bytes(size), "10.0.0.1", "10.0.0.2", offset=offset, more=more)
-    frames = [first, middle, link_frame(packet), last]
-    assert found(frames) == ([], {"fragment_lost": 4})
-
-
-def test_fragments_beyond_the_largest_datagram_are_lost() -> None:
-    packet = ipv4_packet(bytes(1000), "10.0.0.1", "10.0.0.2", offset=65000, more=False)
-    assert found([*fragments(1)[:1], link_frame(packet)]) == ([], {"fragment_lost": 2})
-
-
-def test_a_datagram_shorter_than_its_udp_length_is_lost() -> None:
-    udp = (7).to_bytes(2, "big") * 2 + (3000).to_bytes(2, "big") + bytes(1002)
-    frames = [
-        link_frame(ipv4_packet(udp[:504], "10.0.0.1", "10.0.0.2", more=True)),
-        link_frame(ipv4_packet(udp[504:], "10.0.0.1", "10.0.0.2", offset=504)),
-    ]
-    assert found(frames) == ([], {"fragment_lost": 2})
-
-
-def test_the_udp_length_cuts_a_longer_datagram() -> None:
-    udp = (7).to_bytes(2, "big") * 2 + (600).to_bytes(2, "big") + bytes(1002)
-    frames = [
-        link_frame(ipv4_packet(udp[:504], "10.0.0.1", "10.0.0.2", more=True)),
-        link_frame(ipv4_packet(udp[504:], "10.0.0.1", "10.0.0.2", offset=504)),
-    ]
-    assert found(frames)[0] == [bytes(592)]
-
-
-def test_fragments_of_other_protocols_are_not_udp() -> None:
-    packet = ipv4_packet(bytes(800), "10.0.0.1", "10.0.0.2", more=True, protocol=6)
-    assert found([link_frame(packet)]) == ([], {"not_udp": 1})
-
-
-def test_destinations_keep_sets_apart() -> None:
-    frames = [udp_frame(payload(i), "10.0.0.1", f"10.0.1.{i}", mtu=MTU) for i in (1, 2)]
-    mixed = [frame for pair in zip(*frames, strict=True) for frame in pair]
-    assert found(mixed)[0] == [payload(1), payload(2)]
-
-
-def test_ipv6_fragments_interleave_with_ipv4() -> None:
-    six = udp_frame(payload(6), "fe80::1", "fe80::2", mtu=600)
-    four = fragments(4)
-    mixed = [frame for pair in zip(six, four, strict=True) for frame in pair]
-    assert found(mixed) == ([payload(6), payload(4)], {"fragment": 4})
+def test_sets_older_than_a_second_are_dropped(
+    begin_ns: int, next_ns: int, skipped: dict[str, int]
+) -> None:
+    records = [(begin_ns, FIRST), (next_ns, MIDDLE), (next_ns, LAST)]
+    seen, found = seen_and_skipped(records)
+    assert (len(seen), found) == ("fragment" in skipped, skipped)
 
 
 def test_open_sets_are_bounded(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,8 +1,8 @@
-"""Compiled loops over captures: records, whole and damaged, and bytes of packets."""
+"""Compiled loops over captures; the records they find: test_recording.py."""
 
 from __future__ import annotations
 
-import random
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -10,33 +10,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mlbatch.errors import RecordingError
 from mlbatch.native.capture import CaptureLoops
 from tests.builders.captures import pcap_bytes, udp_frame
 from tests.builders.reading import open_capture, read
-from tests.readers.capture.test_recording import damaged, mixed_frames
-from tests.reference.capture import ODD, dissect, pcap_frames
-
-BUFFERS = (64, 700, 4096, 65_536)
-
-
-@pytest.mark.parametrize("seed", range(120))
-def test_captures_whole_and_damaged(tmp_path: Path, seed: int) -> None:
-    pick = random.Random(seed)
-    path = tmp_path / "capture"
-    written = pcap_bytes(mixed_frames(pick), big_endian=pick.random() < 0.5)
-    for content in (written, damaged(written, pick), damaged(written, pick)):
-        path.write_bytes(content)
-        try:
-            recording = open_capture(path, buffer_bytes=pick.choice(BUFFERS))
-        except RecordingError:
-            continue
-        expected, skipped = dissect(pcap_frames(content))
-        if ODD in skipped:
-            continue
-        seen = [(one.host_ns, one.stream, one.payload) for one in read(recording)]
-        assert seen == expected
-        assert recording.counts.skipped == skipped
 
 
 def test_more_frames_than_there_is_room_for(tmp_path: Path) -> None:
@@ -61,22 +37,34 @@ def test_runs_are_copied() -> None:
     assert out.tobytes() == copied.ljust(5000, b"\0")
 
 
-@pytest.mark.parametrize(
-    ("start", "size", "place"),
-    [(-1, 4, 0), (98, 4, 0), (0, 4, 48), (0, 4, -1), (0, -1, 0), (0, 2**62, 0), (2**62, 1, 0)],
-)
-def test_runs_beyond_their_arrays_are_refused(start: int, size: int, place: int) -> None:
+def _copy(start: int, size: int, place: int) -> None:
     source, out = np.zeros(100, np.uint8), np.zeros(50, np.uint8)
-    run = (np.array([one]) for one in (start, size, place))
-    first, count, at = run
-    with pytest.raises(IndexError):
-        CaptureLoops().copy_runs(source, first, count, out, at)
+    first, count, at = (np.array([one]) for one in (start, size, place))
+    CaptureLoops().copy_runs(source, first, count, out, at)
 
 
-@pytest.mark.parametrize(("begin", "end"), [(-1, 10), (0, 101), (2**40, 2**41)])
-def test_bytes_beyond_the_buffer_are_not_walked(begin: int, end: int) -> None:
+def _walk(begin: int, end: int) -> None:
+    CaptureLoops().walk(np.zeros(100, np.uint8), begin, end, False, 1, 1 << 18)
+
+
+def _sum_at(begin: int) -> None:
+    CaptureLoops().sums(np.zeros(100, np.uint8), np.array([0, begin]), 10)
+
+
+@pytest.mark.parametrize(
+    ("loop", "values"),
+    [
+        *((_copy, run) for run in ((-1, 4, 0), (98, 4, 0), (0, 4, 48), (0, 4, -1), (0, -1, 0))),
+        *((_copy, run) for run in ((0, 2**62, 0), (2**62, 1, 0))),
+        *((_walk, span) for span in ((-1, 10), (0, 101), (2**40, 2**41))),
+        *((_sum_at, (begin,)) for begin in (-1, 91, 2**40)),
+    ],
+)
+def test_bytes_beyond_the_arrays_are_refused(
+    loop: Callable[..., None], values: tuple[int, ...]
+) -> None:
     with pytest.raises(IndexError):
-        CaptureLoops().walk(np.zeros(100, np.uint8), begin, end, False, 1, 1 << 18)
+        loop(*values)
 
 
 def _sum(payload: bytes) -> int:
@@ -112,9 +100,3 @@ def test_sums_are_those_of_words(size: int, seed: int, data: st.DataObject) -> N
     found = CaptureLoops().sums(content, start, size)
     assert found.tolist() == [_sum(packet) for packet in packets]
     assert CaptureLoops().sums(content, start[:0], size).tolist() == []
-
-
-@pytest.mark.parametrize("begin", [-1, 91, 2**40])
-def test_sums_beyond_the_array_are_refused(begin: int) -> None:
-    with pytest.raises(IndexError):
-        CaptureLoops().sums(np.zeros(100, np.uint8), np.array([0, begin]), 10)

@@ -36,14 +36,6 @@ POINTS = [
 ]
 
 
-@pytest.fixture
-def shell(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
-) -> Shell:
-    monkeypatch.chdir(tmp_path)
-    return Shell(monkeypatch, capsys)
-
-
 def _starts() -> list[int]:
     return [START_NS + number * 100 * MS for number in range(SWEEPS)]
 
@@ -102,36 +94,54 @@ def test_points_are_at_the_time_of_the_name_and_their_own(shell: Shell) -> None:
     assert shell("verify out").code == 0
 
 
-@pytest.mark.parametrize("data", ["binary", "ascii"])
-def test_pcd_gives_the_same_scans(shell: Shell, data: str) -> None:
-    write_sweeps(Path("drive/top"), _names())
-    assert _run(shell).code == 0
-    expected = _xyz()
-    for path in Path("drive/top").iterdir():
-        path.unlink()
-    write_sweeps(
-        Path("drive/top"), {f"{start}.pcd": pcd(FIELDS, POINTS, data) for start in _starts()}
-    )
-    outcome = _run(shell, "{glob: top/*.pcd, from: start}")
-    assert outcome.code == 0, outcome.err
-    assert _columns() == EXPECTED
-    np.testing.assert_array_equal(_xyz(), expected)
+def _pcds(data: str) -> dict[str, bytes]:
+    return {f"{start}.pcd": pcd(FIELDS, POINTS, data) for start in _starts()}
 
 
-@pytest.mark.parametrize("data", ["binary", "ascii"])
-def test_whole_numbers_of_64_bits_are_times(shell: Shell, data: str) -> None:
+def _pcds_of_us(data: str) -> dict[str, bytes]:
     """Microseconds since 1970, as in the PCD files of TruckScenes: exact as float64."""
     fields = {"x": "f4", "y": "f4", "z": "f4", "intensity": "f4", "timestamp": "u8"}
-    files = {
+    return {
         f"{start}.pcd": pcd(
             fields, [(*one[:4], start // 1000 + one[4] // 1000) for one in POINTS], data
         )
         for start in _starts()
     }
+
+
+def _named(name: str, unit: int = 1) -> dict[str, bytes]:
+    names = [name.format(start // unit, *divmod(start, 10**9)) for start in _starts()]
+    return dict.fromkeys(names, raw(FIELDS, POINTS))
+
+
+PADDED = {"x": "f4", "pad": "u1", "y": "f4", "z": "f4", "intensity": "f4", "t": "u4"}
+PADDED_POINTS = [(x, 255, y, z, i, t) for x, y, z, i, t, _ in POINTS]
+# Files of the same sweeps, and how the rig describes them.
+FORMS: Mapping[str, tuple[Mapping[str, bytes], str]] = {
+    "pcd, binary": (_pcds("binary"), "{glob: top/*.pcd, from: start}"),
+    "pcd, ascii": (_pcds("ascii"), "{glob: top/*.pcd, from: start}"),
+    "64 bits, binary": (_pcds_of_us("binary"), "{glob: top/*.pcd, unit: us, from: absolute}"),
+    "64 bits, ascii": (_pcds_of_us("ascii"), "{glob: top/*.pcd, unit: us, from: absolute}"),
+    # The unit of a name is that of its digits.
+    "names in us": (_named("{0}.bin", 1000), GLOB),
+    "names in ms": (_named("{0}.bin", MS), GLOB),
+    "names in s and ns": (_named("{1}.{2:09d}.bin"), GLOB),
+    "names of two numbers": (_named("{1}_{2:09d}.bin"), GLOB),
+    "padding": (
+        {f"{start}.bin": raw(PADDED, PADDED_POINTS) for start in _starts()},
+        f"{{glob: top/*.bin, dtype: {dtype_text({**PADDED, 'pad': 'V1'})}, from: start}}",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", FORMS)
+def test_every_form_gives_the_same_scans(shell: Shell, name: str) -> None:
+    files, points = FORMS[name]
     write_sweeps(Path("drive/top"), files)
-    outcome = _run(shell, "{glob: top/*.pcd, unit: us, from: absolute}")
+    outcome = _run(shell, points)
     assert outcome.code == 0, outcome.err
     assert _columns() == EXPECTED
+    np.testing.assert_array_equal(_xyz(), [(x, y, z + 1) for x, y, z, *_ in POINTS * SWEEPS])
 
 
 def test_two_lidars_in_folders_of_their_own(shell: Shell) -> None:
@@ -148,30 +158,6 @@ def test_two_lidars_in_folders_of_their_own(shell: Shell) -> None:
     assert _columns() == sorted({*EXPECTED, *(stamp + 50 * MS for stamp in EXPECTED)})
     assert len(_xyz()) == 2 * SWEEPS * COLUMNS * RINGS
     assert "top" not in shell("inspect drive --rig rig.yaml").out
-
-
-@pytest.mark.parametrize(
-    ("name", "unit"),
-    [("{0}", 1), ("{0}", 1000), ("{0}", MS), ("{1}.{2:09d}", 1), ("{1}_{2:09d}", 1)],
-)
-def test_the_unit_of_a_name_is_that_of_its_digits(shell: Shell, name: str, unit: int) -> None:
-    names = [
-        name.format(start // unit, start // 10**9, start % 10**9) + ".bin" for start in _starts()
-    ]
-    write_sweeps(Path("drive/top"), dict.fromkeys(names, raw(FIELDS, POINTS)))
-    assert _run(shell).code == 0
-    assert _columns() == EXPECTED
-
-
-def test_padding_is_skipped(shell: Shell) -> None:
-    fields = {"x": "f4", "pad": "u1", "y": "f4", "z": "f4", "intensity": "f4", "t": "u4"}
-    points = [(x, 255, y, z, i, t) for x, y, z, i, t, _ in POINTS]
-    sweeps = {f"{start}.bin": raw(fields, points) for start in _starts()}
-    write_sweeps(Path("drive/top"), sweeps)
-    text = dtype_text({**fields, "pad": "V1"})
-    outcome = _run(shell, f"{{glob: top/*.bin, dtype: {text}, from: start}}")
-    assert outcome.code == 0, outcome.err
-    assert _columns() == EXPECTED
 
 
 def test_a_file_cut_off_is_counted_and_named(shell: Shell) -> None:
@@ -374,14 +360,3 @@ def test_a_rig_of_inspect_describes_the_same_folder(shell: Shell) -> None:
     outcome = shell("convert drive --rig again.yaml -o again --keep-partial")
     assert outcome.code == 0, outcome.err
     np.testing.assert_array_equal(_xyz("again"), expected)
-
-
-def test_jobs_give_the_same_files(shell: Shell) -> None:
-    write_sweeps(Path("drive/top"), _names())
-    _rig(GLOB)
-    found = set()
-    for jobs in (1, 2):
-        options = f"--jobs {jobs} --overwrite"
-        assert shell(f"convert drive --rig rig.yaml -o out {options}").code == 0
-        found.add(b"".join(path.read_bytes() for path in scan_files(Path("out"))))
-    assert len(found) == 1
