@@ -1,6 +1,7 @@
-"""The intake of one sensor, worked by hand and compared with the literal one; times in ms.
+"""The intake of one sensor: equal to the literal one, its texts and counts; times in ms.
 
-Steps above 1 s need confirmation.
+The rules by hand, of the literal intake as well: `test_reference.py`. Steps above 1 s need
+confirmation.
 """
 
 from __future__ import annotations
@@ -10,12 +11,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mlbatch.arrays import I64Array
-from mlbatch.batching.intake import DUPLICATE_REACH, FOREVER, NEVER, Accepted, Arrival, Intake
+from mlbatch.batching.intake import FOREVER, NEVER, Accepted, Arrival, Intake
 from mlbatch.errors import ClockError, ClockJump
 from mlbatch.lidar.headers import Headers
 from tests.builders.arrivals import WIDEST, accepted_by, arrival_of
@@ -79,14 +79,6 @@ def test_packets_of_other_sensors_and_damaged_ones_are_left_out() -> None:
 # -- duplicates -----------------------------------------------------------------------------------
 
 
-def test_the_second_of_two_equal_packets_is_a_duplicate() -> None:
-    intake = _left()
-    arrival = _feed([10], [20], [10], [30], [30], keys=[5, 6, 5, 7, 7])
-    assert _stamps_ms(accepted_by(intake, arrival)) == [[10], [20], [30]]
-    assert intake.rejected == {"duplicate": 2}
-    assert intake.renumbered == 0
-
-
 def test_other_packets_of_the_same_number_are_counted_apart() -> None:
     intake = _left()
     accepted_by(intake, _feed([10], [20], [10], [25], keys=[5, 6, 5, 6]))
@@ -97,79 +89,7 @@ def test_other_packets_of_the_same_number_are_counted_apart() -> None:
     assert (intake.rejected, intake.renumbered) == ({"duplicate": 4}, 2)
 
 
-def test_a_duplicate_is_known_across_batches() -> None:
-    intake = _left()
-    accepted_by(intake, _alone(10, 20, 30))
-    assert _stamps_ms(accepted_by(intake, _alone(30, 40, first_key=2))) == [[40]]
-    assert intake.rejected == {"duplicate": 1}
-
-
-def test_equal_stamps_make_no_duplicate() -> None:
-    assert len(accepted_by(_left(), _feed([10], [10], keys=[1, 2])).position) == 2
-
-
-def test_packets_without_identity_are_never_duplicates() -> None:
-    accepted = accepted_by(_left(), _feed([10], [20], [30], keys=[-1, -1, -1]))
-    assert len(accepted.position) == 3
-
-
-@pytest.mark.parametrize(("between", "rejected"), [(DUPLICATE_REACH - 1, 1), (DUPLICATE_REACH, 0)])
-def test_numbers_repeat_after_a_while(between: int, rejected: int) -> None:
-    """Frame ids wrap: what is far back is another packet."""
-    intake = _left()
-    accepted_by(intake, _alone(0.0))
-    accepted_by(intake, _alone(*np.arange(1, between + 1) / 10, first_key=1))
-    accepted_by(intake, _alone(between / 10 + 1))
-    assert intake.rejected.get("duplicate", 0) == rejected
-
-
 # -- stamps ---------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    ("stamps", "good"),
-    [
-        ([-0.000001], False),
-        ([0], True),
-        ([2**31 * 1000 - 0.001], True),
-        ([2**31 * 1000], False),
-        # Columns of a packet span at most 1 s.
-        ([5000, 6000], True),
-        ([5000, 6000.000001], False),
-    ],
-)
-def test_impossible_stamps(stamps: Stamps, good: bool) -> None:
-    intake = _left(len(stamps))
-    accepted = accepted_by(intake, _feed(stamps))
-    assert len(accepted.position) == good
-    assert intake.rejected == ({} if good else {"bad_stamp": 1})
-
-
-def test_a_wild_stamp_that_the_next_packet_does_not_confirm_is_rejected() -> None:
-    intake = _left()
-    accepted = accepted_by(intake, _alone(10, 20, 7020, 30, 40))
-    assert _stamps_ms(accepted) == [[10], [20], [30], [40]]
-    assert intake.rejected == {"bad_stamp": 1}
-    intake.finish()
-    assert intake.rejected == {"bad_stamp": 1}
-
-
-@pytest.mark.parametrize(("step_ms", "held"), [(1000, False), (1000.000001, True)])
-def test_a_step_of_one_second_needs_no_confirmation(step_ms: float, held: bool) -> None:
-    intake = _left()
-    accepted = accepted_by(intake, _alone(10, 10 + step_ms))
-    assert len(accepted.position) == (1 if held else 2)
-    assert (intake.held_ring_index is not None) == held
-
-
-def test_a_gap_is_confirmed_by_the_next_packet() -> None:
-    """Both are delivered with the packet that confirms."""
-    intake = _left()
-    accepted = accepted_by(intake, _alone(10, 20, 5000, 5010, 5020))
-    assert _stamps_ms(accepted) == [[10], [20], [5000], [5010], [5020]]
-    assert accepted.position.tolist() == [0, 1, 3, 3, 4]
-    assert accepted.ahead_ns == 4980 * MS
-    assert intake.rejected == {}
 
 
 def test_a_packet_is_held_until_the_next_batch() -> None:
@@ -182,20 +102,6 @@ def test_a_packet_is_held_until_the_next_batch() -> None:
     assert _stamps_ms(second) == [[5000], [5010]]
     assert second.position.tolist() == [0, 0]
     assert intake.held_ring_index is None
-
-
-def test_a_packet_that_is_held_at_the_end_was_never_confirmed() -> None:
-    intake = _left()
-    accepted_by(intake, _alone(10, 20, 90_000))
-    intake.finish()
-    assert intake.rejected == {"bad_stamp": 1}
-    assert intake.held_ring_index is None
-
-
-def test_two_wild_packets_do_not_confirm_each_other() -> None:
-    intake = _left()
-    assert _stamps_ms(accepted_by(intake, _alone(10, 5000, 9000, 20))) == [[10], [20]]
-    assert intake.rejected == {"bad_stamp": 2}
 
 
 def test_a_reset_clock_is_an_error_that_names_both_times() -> None:
@@ -225,21 +131,6 @@ def test_a_clock_that_is_set_forward_is_an_error_that_names_both_times() -> None
         assert len(accepted_by(_left(finds_jumps=True), silent).position) == 3
 
 
-def test_a_single_step_back_is_rejected() -> None:
-    intake = _left()
-    assert _stamps_ms(accepted_by(intake, _alone(100_000, 3, 100_010))) == [[100_000], [100_010]]
-    assert intake.rejected == {"bad_stamp": 1}
-
-
-def test_invalid_columns_are_no_stamps() -> None:
-    """The stamp of a masked column neither delays a packet nor counts as newest."""
-    intake = _left(2)
-    arrival = _feed([10, 10], [20, 9e6], [-5, 30], valid=[[1, 1], [1, 0], [0, 1]])
-    accepted = accepted_by(intake, arrival)
-    assert accepted.newest_ns.tolist() == [10 * MS, 20 * MS, 30 * MS]
-    assert (intake.rejected, accepted.invalid) == ({}, 2)
-
-
 def test_a_packet_without_a_valid_column_is_accepted() -> None:
     accepted = accepted_by(_left(), _feed([10], [9e6], [20], valid=[[1], [0], [1]]))
     assert accepted.newest_ns.tolist() == [10 * MS, NEVER, 20 * MS]
@@ -257,25 +148,6 @@ def test_a_pass_that_measures_clocks_takes_all() -> None:
 def test_an_offset_is_added_to_the_stamps() -> None:
     intake = _left(offset_ns=-37 * S)
     assert _stamps_ms(accepted_by(intake, _alone(37_010, 37_020))) == [[10], [20]]
-
-
-def test_the_host_clock_keeps_the_age_of_columns_within_their_packet() -> None:
-    """The newest column gets the receive time of its packet."""
-    intake = _left(2, host_clock=True)
-    arrival = _feed([10, 12], [20, 22])
-    arrival = arrival._replace(host_ns=np.array([1_000_000 * MS, 1_000_011 * MS]))
-    accepted = accepted_by(intake, arrival)
-    assert _stamps_ms(accepted) == [[999_998, 1_000_000], [1_000_009, 1_000_011]]
-    assert accepted.newest_ns.tolist() == [1_000_000 * MS, 1_000_011 * MS]
-
-
-def test_loss_is_counted_of_accepted_packets_only() -> None:
-    intake = _left(modulus=64)
-    # 2 and 3 are missing; 1 comes twice; the wild one is number 6.
-    arrival = _feed([10], [20], [20], [30], [50_000], [40], keys=[0, 1, 1, 4, 6, 5])
-    accepted_by(intake, arrival)
-    assert (intake.loss.lost, intake.loss.reordered) == (2, 0)
-    assert intake.rejected == {"duplicate": 1, "bad_stamp": 1}
 
 
 # -- the literal intake ---------------------------------------------------------------------------

@@ -102,12 +102,6 @@ def test_windows_are_half_open() -> None:
     assert at_index(outcome, 1).columns == [(0, 1, 1)]
 
 
-def test_equal_stamps_are_sorted_by_sensor_then_delivery() -> None:
-    feed = [packet(0, 50), packet(1, 50), packet(1, 120, 120), packet(0, 120), packet(0, 120)]
-    outcome = batched([*feed, packet(1, 250), packet(0, 250)], TWO)
-    assert at_index(outcome, 0).columns == [(0, 1, 0), (0, 2, 0), (1, 1, 0), (1, 1, 1)]
-
-
 def test_columns_are_sorted_by_stamp_sensor_delivery() -> None:
     feed = [
         packet(0, 50),
@@ -403,13 +397,6 @@ def test_slices_are_published_one_by_one() -> None:
     assert first == [(j, (100 + 25 * j) * MS, (125 + 25 * j) * MS) for j in range(4)]
     # [100, 125) closes when its sensor is 10 ms past it.
     assert outcome.windows[0].ready_host_ns == 140 * MS
-
-
-def test_slices_of_15_hz_are_rounded_up_from_the_exact_product() -> None:
-    # k = 1, 4 slices: 1e9 * (1 + j / 4) / 15 = 66 666 666.7, 83 333 333.3, 100 000 000.
-    feed = [FeedPacket(0, n, -1, (n,), (True,)) for n in (0, 66_666_667, 83_333_334, 100_000_000)]
-    outcome = batched(feed, replace(TEN_HZ, rate=Fraction(15), slices=4))
-    assert spans(outcome) == [(0, 66_666_667, 83_333_334), (0, 83_333_334, 100_000_000)]
 
 
 def test_start_and_end_choose_windows_by_their_start() -> None:
