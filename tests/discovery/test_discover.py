@@ -16,7 +16,6 @@ from mlbatch.errors import RecordingError, RigError, UsageError
 from mlbatch.readers import open_recording
 from mlbatch.types import StreamTable
 from tests.builders.sessions import (
-    FIXTURE,
     NS_PER_S,
     SMALL,
     Unit,
@@ -81,15 +80,6 @@ def test_two_lidars_need_extrinsics_or_identity_on_request(tmp_path: Path) -> No
     assert [s.name for s in _discover(capture, SensorSelection(only=("222",))).sensors] == [
         "ouster_222"
     ]
-
-
-def test_the_rig_gives_names_order_frame_and_extrinsics(tmp_path: Path) -> None:
-    found = _discover(FIXTURE / "two_lidars.pcap", SensorSelection(rig=FIXTURE / "rig.yaml"))
-    assert [sensor.name for sensor in found.sensors] == ["left", "right"]
-    assert [sensor.pose.source for sensor in found.sensors] == ["rig", "rig"]
-    assert found.sensors[0].pose.body_from_sensor[:3, 3].tolist() == [0.3, 0.95, 2.45]
-    assert found.frame_id == "base_link"
-    assert found.notes == []
 
 
 def test_the_extrinsics_of_the_rig_come_before_those_of_the_metadata(tmp_path: Path) -> None:
@@ -161,15 +151,3 @@ def test_warnings_of_a_decoder_become_notes(tmp_path: Path) -> None:
     (note,) = _discover(capture).notes
     assert (note.code, note.sensor) == ("calibration", "ouster_111")
     assert "off" in note.message
-
-
-def test_a_sensor_of_the_rig_that_is_silent_at_first_is_noted(tmp_path: Path) -> None:
-    capture = write_session(tmp_path, Unit())
-    rig = tmp_path / "rig.yaml"
-    rig.write_text(
-        'sensors:\n- {name: front, stream: {serial: "111"}, extrinsics: {translation_m: [0, 0, 0]}}'
-        "\n- {name: rear, stream: {source_ip: 10.0.0.2}, metadata: 111.json, "
-        "extrinsics: {translation_m: [1, 0, 0]}}\n"
-    )
-    (note,) = _discover(capture, SensorSelection(rig=rig)).notes
-    assert (note.code, note.sensor) == ("not_seen_yet", "rear")

@@ -40,11 +40,8 @@ IDENTITY = "--identity-extrinsics"
 
 
 @pytest.fixture
-def convert(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
-) -> Convert:
+def convert(shell: Shell) -> Convert:
     """The report of a dry run."""
-    shell = _shell(monkeypatch, capsys, tmp_path)
 
     def run(arguments: str) -> Report:
         outcome = shell(f"convert {arguments} --dry-run --keep-partial")
@@ -53,20 +50,6 @@ def convert(
         return report
 
     return run
-
-
-@pytest.fixture
-def shell(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
-) -> Shell:
-    return _shell(monkeypatch, capsys, tmp_path)
-
-
-def _shell(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], folder: Path
-) -> Shell:
-    monkeypatch.chdir(folder)
-    return Shell(monkeypatch, capsys)
 
 
 def _read(report: Report) -> dict[str, int]:
@@ -117,11 +100,29 @@ AFTER_12_S = ONE.begin_ns + 12 * NS_PER_S
 MOVED_PORTS = Unit(spec=replace(SMALL, serial=222, imu_port=7603), port=7602)
 NEEDS_METADATA = "Ouster lidar, serial {}, 1280 bytes: needs its metadata"
 NOT_SEEN = ("not_seen_yet", "rear", "no packet of it in the first 10 seconds")
+UNASSIGNED = (
+    "unassigned",
+    "",
+    "10.0.0.1 > port 7502: expected packets of ouster_111, found "
+    f"{NEEDS_METADATA.format(333)} as well; {PACKETS} packets are counted as unassigned; give the "
+    "--metadata of that lidar, or leave it out with --ignore SERIAL",
+)
 HELLO = udp_frame(b"hello", "10.0.0.9", dport=9000)[0]
 CUT = [
     (host_ns, udp_frame(payload[:1000], ONE.ip, dport=ONE.port)[0])
     for host_ns, payload in ONE.payloads[5:8]
 ]
+
+
+def _not_in_rig(ip: str, serial: int) -> tuple[str, str, str]:
+    return (
+        "not_in_rig",
+        "",
+        f"{ip} > port 7502: {NEEDS_METADATA.format(serial)}; expected a sensor of the rig, found "
+        "none for it; its packets are counted as unassigned; add it to the rig, or leave it out "
+        f"with --ignore {ip}",
+    )
+
 
 CASES = {
     "two on one port": Case(
@@ -170,16 +171,7 @@ CASES = {
         {"ouster_111": PACKETS},
         without=(333,),
         unassigned=(("10.0.0.1 > port 7502", PACKETS, "Ouster lidar, serial 333"),),
-        warnings=(
-            (
-                "unassigned",
-                "",
-                "10.0.0.1 > port 7502: expected packets of ouster_111, found "
-                f"{NEEDS_METADATA.format(333)} as well; {PACKETS} packets are counted as "
-                "unassigned; give the --metadata of that lidar, or leave it out with --ignore "
-                "SERIAL",
-            ),
-        ),
+        warnings=(UNASSIGNED,),
     ),
     **{
         f"a lidar that the user leaves out, as {word}": Case(
@@ -217,16 +209,7 @@ CASES = {
             ("10.0.0.1 > port 7502", PACKETS, "Ouster lidar, serial 333"),
             ("10.0.0.1 > port 7502", PACKETS, "ignored: Ouster lidar, serial 222"),
         ),
-        warnings=(
-            (
-                "unassigned",
-                "",
-                "10.0.0.1 > port 7502: expected packets of ouster_111, found "
-                f"{NEEDS_METADATA.format(333)} as well; {PACKETS} packets are counted as "
-                "unassigned; give the --metadata of that lidar, or leave it out with --ignore "
-                "SERIAL",
-            ),
-        ),
+        warnings=(UNASSIGNED,),
     ),
     "one that begins late": Case(
         (ONE, replace(twin(ONE, 222), begin_ns=AFTER_12_S)),
@@ -278,6 +261,14 @@ CASES = {
         imu={"ouster_111": 5, "ouster_222": 3},
         unassigned=(("10.0.0.1 > port 9999", 2, "Ouster IMU (48 bytes)"),),
     ),
+    "a lidar without metadata that is not in the rig": Case(
+        (ONE, twin(ONE, 333)),
+        {"front": PACKETS},
+        without=(333,),
+        rig=('name: front, stream: {serial: "111"}',),
+        unassigned=(("10.0.0.2 > port 7502", PACKETS, "not_in_rig: Ouster lidar, serial 333"),),
+        warnings=(_not_in_rig("10.0.0.2", 333),),
+    ),
     "lidars that are not in the rig": Case(
         (ONE, twin(ONE, 222), replace(twin(ONE, 444, "10.0.0.4"), begin_ns=AFTER_12_S)),
         {"front": PACKETS},
@@ -286,16 +277,7 @@ CASES = {
             ("10.0.0.2 > port 7502", PACKETS, "not_in_rig: Ouster lidar, serial 222"),
             ("10.0.0.4 > port 7502", PACKETS, "not seen in the first 10 s: Ouster lidar"),
         ),
-        warnings=tuple(
-            (
-                "not_in_rig",
-                "",
-                f"{ip} > port 7502: {NEEDS_METADATA.format(serial)}; expected a sensor of the rig, "
-                "found none for it; its packets are counted as unassigned; add it to the rig, or "
-                f"leave it out with --ignore {ip}",
-            )
-            for ip, serial in (("10.0.0.2", 222), ("10.0.0.4", 444))
-        ),
+        warnings=(_not_in_rig("10.0.0.2", 222), _not_in_rig("10.0.0.4", 444)),
     ),
     "lidars that are not in the rig and left out": Case(
         (ONE, twin(ONE, 222), replace(twin(ONE, 444, "10.0.0.4"), begin_ns=AFTER_12_S)),
@@ -402,15 +384,6 @@ def test_a_lidar_left_out_whole_is_an_error(shell: Shell, tmp_path: Path, option
     assert not (tmp_path / "out").exists()
     # Without a conversion it is a row of the table.
     assert "metadata" in shell(f"inspect {capture}").out
-
-
-def test_of_a_rig_other_lidars_are_counted(convert: Convert, tmp_path: Path) -> None:
-    capture = write_session(tmp_path, ONE, twin(ONE, 333))
-    (tmp_path / "333.json").unlink()
-    rig = _rig(tmp_path, ['name: front, stream: {serial: "111"}'])
-    report = convert(f"{capture} --rig {rig}")
-    (other,) = report["unassigned"]
-    assert other["what"].startswith("not_in_rig: Ouster lidar, serial 333")
 
 
 def test_foreign_files_in_the_directory_are_ignored(convert: Convert, tmp_path: Path) -> None:

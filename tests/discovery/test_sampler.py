@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from mlbatch.discovery.discover import SensorSelection, discover
-from mlbatch.discovery.sampler import SAMPLES_PER_KIND, Sampler, split_by_kind
+from mlbatch.discovery.sampler import SAMPLES_PER_KIND, KindSamples, Sampler, split_by_kind
 from mlbatch.discovery.types import PacketKind
 from mlbatch.readers import open_recording
 from mlbatch.types import PacketBatch, Stream, StreamTable
@@ -106,3 +106,29 @@ def test_samples_may_be_asked_for_between_batches() -> None:
             packets, received_ns = samples.arrays()
             assert packets[:, 0].tolist() == words
             assert received_ns.tolist() == host_ns[: len(words)]
+
+
+# -- shares of the bytes, worked by hand ------------------------------------------------------
+
+
+def _counted(*counts: tuple[int, int]) -> tuple[Sampler, list[PacketKind]]:
+    """Packets and bytes of a packet, by stream."""
+    sampler = Sampler(StreamTable())
+    kinds = [PacketKind(number, size) for number, (_, size) in enumerate(counts)]
+    for kind, (packets, _) in zip(kinds, counts, strict=True):
+        sampler.kinds[kind] = KindSamples([], [], [], packets, 0, 0, set())
+    return sampler, kinds
+
+
+def test_share_of_bytes() -> None:
+    sampler, (lidar, camera) = _counted((10, 300), (9, 1000))
+    assert sampler.share_of({lidar}) == pytest.approx(3000 / 12000)
+    assert sampler.share_of({camera}) == pytest.approx(9000 / 12000)
+    assert sampler.share_of({lidar, camera}) == 1.0
+    # 12000 bytes of 19 packets: 19 more have as many.
+    sampler.crowd.packets = 19
+    assert sampler.share_of({lidar}) == pytest.approx(3000 / 24000)
+
+
+def test_share_of_nothing() -> None:
+    assert _counted()[0].share_of(set()) == 0.0
