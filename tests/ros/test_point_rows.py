@@ -8,9 +8,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mlbatch.ros.point_packets import CloudError, Layout, Points, layout_of, pack
+from mlbatch.ros.point_packets import Layout, Points, layout_of, pack
 from mlbatch.ros.point_rows import Rows, take_rows
-from tests.builders.points import read_packets
 from tests.reference.clouds import packets_of, taken_rows
 
 STAMP_NS = 1_700_000_000_000_000_000
@@ -138,22 +137,3 @@ def test_times_that_do_not_fit_one_word_with_their_rings_are_packed() -> None:
     stamp = random.permutation(70_000) * 142_000
     points = _points(stamp, random.permutation(70_000) % 65_536, random)
     _assert_equal(points, Layout(0, 1))
-
-
-def test_a_point_of_each_ring_by_hand() -> None:
-    """Two columns of two rings in ring order; the first ring has no second point."""
-    nothing = np.zeros(3, np.uint8)
-    reals = np.array([[1, 2, 3], [0, 0, 0], [0, 0, 0], [7, 8, 9]], np.float32)
-    stamp_ns = np.array([0, 0, 50], np.int64) + STAMP_NS
-    points = Points(stamp_ns, reals, np.array([0, 1, 1], np.uint16), nothing, nothing)
-    first, second = read_packets(pack(points, Layout(0, 2, by_ring=True), 0))
-    assert (first.stamp_ns, first.number, first.count, first.x) == (STAMP_NS, 0, 2, (1, 2))
-    assert (second.stamp_ns, second.number, second.count) == (STAMP_NS + 50, 1, 1)
-    assert (second.x, second.level, second.ring) == ((0, 3), (0, 9), (0, 1))
-
-
-def test_memory_is_bounded() -> None:
-    random = np.random.default_rng(1)
-    points = _points(np.arange(10_000), None, random)
-    with pytest.raises(CloudError, match="expected points that share times as in the first cloud"):
-        pack(points, Layout(0, 256), 22 * 10_000)
