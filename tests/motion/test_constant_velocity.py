@@ -13,8 +13,7 @@ from mlbatch.writers.formats import npz
 from mlbatch.writers.output_file import Bytes
 from tests.builders.sessions import Shell, arrays, names, report_of
 from tests.builders.simulated import Recorded, record, scenario_text
-from tests.motion.test_wall import SCENE
-from tests.motion.test_wall_converted import bend_m
+from tests.motion.test_wall import SCENE, bend_m
 
 pytestmark = pytest.mark.long
 SENSORS = """\

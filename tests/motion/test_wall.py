@@ -1,26 +1,19 @@
-"""A static wall seen from a turning, driving platform, with and without motion correction.
-
-The scans are those of `convert` from a simulated recording; each point is moved by the transform of
-its column. Measured: the largest distance of the wall's points from their best plane, per scan.
-"""
+"""A static wall seen from a turning, driving platform, as `convert --deskew` writes it."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import json
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+import mlbatch
 from mlbatch.arrays import F64Array
-from mlbatch.motion.imu import integrated
-from mlbatch.motion.track import PoseTrack
-from mlbatch.motion.tum import read_tum
-from mlbatch.outputs.scan import Scan
-from mlbatch.types import instant_ns
-from tests.builders.simulated import Recorded, record, scenario_text
-from tests.reference.motion import column_motion
+from tests.builders.sessions import Shell
+from tests.builders.simulated import record, scenario_text
 
+pytestmark = pytest.mark.long
 WALL = 200
 MOTION = """\
 motion:
@@ -53,75 +46,106 @@ IMU = (
     "accel_bias: [0.05, -0.03, 0.04], "
     "extrinsics: {translation_m: [0.3, 0.2, -0.1], rotation_rpy_deg: [0, 3, -90]}}\n"
 )
+# Scans of 0.1 s, the first from 0.1 s on, that begin after the standstill of 1.5 s.
+MOVING = 15
+OWN_IMU = (
+    "    imu: {gyro_noise: 0.002, accel_noise: 0.02, gyro_bias: [0.01, -0.02, 0.015], "
+    "accel_bias: [0.05, -0.03, 0.04]}\n"
+)
 
 
-@pytest.fixture(scope="module")
-def drive(tmp_path_factory: pytest.TempPathFactory) -> tuple[Recorded, list[Scan]]:
-    text = scenario_text(SENSORS, scene=SCENE, motion=MOTION, duration=4.5, more=IMU)
-    recorded = record(tmp_path_factory.mktemp("wall"), text)
-    scans = [scan for scan in recorded.scans() if scan.complete]
-    assert len(scans) > 40
-    return recorded, scans
-
-
-def deviations(scans: list[Scan], moved: Callable[[Scan], F64Array]) -> F64Array:
-    """The largest distance from the best plane in each scan, m."""
+def bend_m(folder: Path) -> F64Array:
+    """The largest distance of the wall's points from their best plane, of each whole scan."""
     found = []
-    for scan in scans:
-        assert scan.reflectivity is not None
-        points = moved(scan)[scan.reflectivity == WALL]
-        if len(points) > 200:
+    for scan in mlbatch.read(folder):
+        level = scan.intensity if scan.reflectivity is None else scan.reflectivity
+        wall = np.abs(level.astype(np.float64) - WALL) < 1
+        points = scan.xyz[wall].astype(np.float64)
+        if scan.complete and len(points) > 200:
             centred = points - points.mean(axis=0)
             normal = np.linalg.svd(centred, full_matrices=False)[2][2]
             found.append(np.abs(centred @ normal).max())
     return np.array(found)
 
 
-def corrected(track: PoseTrack, word: str) -> Callable[[Scan], F64Array]:
-    def move(scan: Scan) -> F64Array:
-        assert scan.column is not None
-        to_ns = instant_ns(word, scan.start_ns, scan.end_ns)
-        motion = column_motion(track, scan.column_stamp_ns, to_ns)
-        assert not motion.no_pose.any()
-        turn = motion.rotation[scan.column]
-        points = np.einsum("nij,nj->ni", turn, scan.xyz.astype(np.float64))
-        moved: F64Array = np.add(points, motion.translation_m[scan.column])
-        return moved
+@pytest.mark.parametrize(
+    ("model", "suffix"),
+    [
+        ("OS1-32", "pcap"),
+        ("OS1-32", "mcap"),
+        ("VLP-16", "db3"),
+        ("PandarXT-32", "mcap"),
+        ("Helios 32", "mcap"),
+    ],
+)
+def test_the_wall_is_flat(shell: Shell, tmp_path: Path, model: str, suffix: str) -> None:
+    sensors = SENSORS.replace("OS1-32", model)
+    is_ouster = model.startswith("OS")
+    if is_ouster and suffix == "pcap":
+        sensors += OWN_IMU
+    elif not is_ouster:
+        sensors = sensors.replace("    columns: 512\n", "")
+    text = scenario_text(sensors, scene=SCENE, motion=MOTION, duration=4.5, more=IMU)
+    drive = record(tmp_path, text, suffix)
+    words = f"convert {drive.path} --rig {drive.rig} -q"
+    assert shell(f"{words} -o bent").code == 0
+    # The platform turns by 4 degrees and drives 0.2 m in a scan.
+    assert bend_m(Path("bent")).max() > 0.2
+    for to in ("start", "end") if is_ouster else ("middle",):
+        assert shell(f"{words} -o {to} --deskew {drive.truth} --deskew-to {to}").code == 0
+        flat_m = bend_m(Path(to))
+        assert len(flat_m) > 35
+        assert flat_m[MOVING:].max() < 3e-3
+        # At rest nothing is moved: Helios counts 2.5 mm and 0.01 degrees, 22 m away and at 66
+        # degrees to the wall 2.3 mm from it, which also tilts the plane of 5652 points.
+        assert flat_m[:MOVING].max() < 3.5e-3
+    # With noise and biases of a small IMU: of the lidar, or recorded.
+    assert shell(f"{words} -o imu --deskew imu").code == 0
+    flat_m = bend_m(Path("imu"))
+    assert len(flat_m) > 35
+    assert flat_m.max() < 15e-3
+    assert shell("verify imu").code == 0
 
-    return move
+
+def test_imu_poses_do_not_depend_on_jobs(shell: Shell, tmp_path: Path) -> None:
+    text = scenario_text(SENSORS, scene=SCENE, motion=MOTION, duration=3.0, more=IMU)
+    drive = record(tmp_path, text, "mcap")
+    words = f"convert {drive.path} --rig {drive.rig} -q --deskew imu"
+    assert shell(f"{words} -o one.mcap").code == 0
+    assert shell(f"{words} -o two.mcap --jobs 3 --max-wait 0.3").code == 0
+    one, two = Path("one.mcap"), Path("two.mcap")
+    assert one.read_bytes() == two.read_bytes()
 
 
-def samples_of(path: Path) -> tuple[F64Array, ...]:
-    lines = [line.split(",") for line in path.read_text().splitlines()[1:]]
-    stamps = np.array([int(line[0]) for line in lines])
-    values = np.array([[float(word) for word in line[1:]] for line in lines])
-    return stamps, values[:, 3:], values[:, :3]
-
-
-def test_without_correction_the_wall_is_bent(drive: tuple[Recorded, list[Scan]]) -> None:
-    """By decimetres: the platform turns by 4 degrees and drives 0.2 m in a scan."""
-    found = deviations(drive[1], lambda scan: scan.xyz.astype(np.float64))
-    assert len(found) > 25
-    assert 0.1 < found.max() < 2.0
-
-
-@pytest.mark.parametrize("word", ["start", "middle", "end"])
-def test_with_true_poses_it_is_flat_within_3_mm(
-    word: str, drive: tuple[Recorded, list[Scan]]
+def test_the_end_of_a_selection_needs_later_samples_of_the_imu(
+    shell: Shell, tmp_path: Path
 ) -> None:
-    track = read_tum(drive[0].truth)
-    # The last window ends after the truth.
-    found = deviations(drive[1][:-1], corrected(track, word))
-    assert len(found) > 25
-    assert found.max() < 3e-3
+    """Windows of the first second have poses when it is complete, also with --end before that."""
+    text = scenario_text(SENSORS, scene=SCENE, motion=MOTION, duration=3.0, more=IMU)
+    drive = record(tmp_path, text, "mcap")
+    words = f"convert {drive.path} --rig {drive.rig} -q --deskew imu"
+    assert shell(f"{words} -o whole").code == 0
+    for end, count in (("+0.5", 5), ("+1.5", 15)):
+        assert shell(f"{words} -o part --overwrite --end {end}").code == 0
+        files = sorted(Path("part").glob("*.npz"))
+        assert len(files) == count
+        for file in files:
+            assert file.read_bytes() == (Path("whole") / file.name).read_bytes()
+        assert shell("verify part").code == 0
 
 
-def test_with_an_imu_it_is_flat_within_15_mm(drive: tuple[Recorded, list[Scan]]) -> None:
-    """Three seconds after the standstill, with noise and biases of a small IMU."""
-    recorded, scans = drive
-    stamps, force, rate = samples_of(recorded.path.with_name("drive.imu.csv"))
-    assert recorded.scenario.imu is not None
-    track = integrated(stamps.astype(np.int64), force, rate, recorded.scenario.imu.body_from_imu)
-    found = deviations(scans[:-1], corrected(track, "start"))
-    assert len(found) > 25
-    assert found.max() < 15e-3
+def test_an_imu_integrated_for_long_is_a_warning(shell: Shell, tmp_path: Path) -> None:
+    """Its velocity is that of an accelerometer with a bias."""
+    motion = MOTION.replace("  sway:", "    - [12, 1.0, 3.0, 1.0, 200]\n  sway:")
+    text = scenario_text(SENSORS, scene=SCENE, motion=motion, duration=12.5, more=IMU)
+    drive = record(tmp_path, text, "mcap")
+    done = shell(f"convert {drive.path} --rig {drive.rig} -o out --deskew imu")
+    assert done.code == 0
+    assert "deskew_drift: the IMU /imu/data was integrated for 11 s" in done.err
+    assert report_has_bias(Path("out/report.json"))
+
+
+def report_has_bias(path: Path) -> bool:
+    """Whether the gyroscope's bias at rest is in the report: 0.01, -0.02, 0.015 rad/s."""
+    bias = json.loads(path.read_text())["deskew"]["gyro_bias_rad_s"]
+    return bool(np.allclose(bias, [0.01, -0.02, 0.015], atol=1e-3))
