@@ -79,16 +79,19 @@ def test_an_output_that_appeared_meanwhile_is_kept(tmp_path: Path) -> None:
     assert (tmp_path / "out.mcap").read_text() == "other run"
 
 
-@pytest.mark.parametrize("target", ["missing/out", "file/out"])
-def test_a_missing_parent_folder_is_named(target: str, tmp_path: Path) -> None:
-    (tmp_path / "file").touch()
-    with pytest.raises(ExportError, match="mkdir -p"):
-        prepare(tmp_path / target, overwrite=False, folder=True)
-
-
-@pytest.mark.parametrize("target", ["..", "/", "."])
-def test_folders_are_no_names(target: str) -> None:
-    with pytest.raises(ExportError, match="add a name"):
+@pytest.mark.parametrize(
+    ("target", "words"),
+    [
+        *(("missing/out", "mkdir -p"), ("file/out", "mkdir -p")),
+        *(("..", "add a name"), ("/", "add a name"), (".", "add a name")),
+    ],
+)
+def test_places_that_are_none_are_named(
+    target: str, words: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("file").touch()
+    with pytest.raises(ExportError, match=words):
         prepare(Path(target), overwrite=True, folder=True)
 
 

@@ -218,8 +218,19 @@ def test_metadata_by_hand(tmp_path: Path) -> None:
             },
         ],
     }
-    counts = {one["topic_metadata"]["name"]: one["message_count"] for one in topics}
-    assert counts == {"/tf_static": 2, "/note": 3, "/left/imu": 2, "/points": 3}
+    counts = {
+        (one["topic_metadata"]["name"], one["topic_metadata"]["type"]): one["message_count"]
+        for one in topics
+    }
+    assert counts == {
+        ("/tf_static", "tf2_msgs/msg/TFMessage"): 2,
+        ("/note", "std_msgs/msg/String"): 3,
+        ("/left/imu", "sensor_msgs/msg/Imu"): 2,
+        ("/points", "sensor_msgs/msg/PointCloud2"): 3,
+    }
+    assert {one["topic_metadata"]["serialization_format"] for one in topics} == {"cdr"}
+    names = sorted(path.name for path in (tmp_path / "drive").iterdir())
+    assert names == ["drive_0.mcap", "drive_1.mcap", "metadata.yaml", "scans.csv"]
 
 
 @pytest.mark.parametrize("name", ["drive é", "run 😀", 'quo"ted\\', "tab\there"])

@@ -2,20 +2,31 @@
 
 from __future__ import annotations
 
-import math
+import struct
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
+from mcap.reader import make_reader
+from rosbags import rosbag1
 
 from mlbatch.errors import ExportError
-from mlbatch.frames.transforms import quaternion
 from mlbatch.ros.encoding import Cdr
-from mlbatch.types import IMU, PACKED_ROOM, Message, PackedPoints, Summary
-from mlbatch.writers import WriterOptions, extras, format_names, open_writer, plugin
+from mlbatch.types import IMU, PACKED_ROOM, Message, PackedPoints, Summary, Topic
+from mlbatch.writers import (
+    WriterOptions,
+    extras,
+    format_names,
+    open_writer,
+    plugin,
+    report_paths,
+)
 from mlbatch.writers.message_writer import CloudMessage, static_edges
 from mlbatch.writers.point_layouts import CLOUD_LAYOUTS
+from tests.builders.bags import Body
+from tests.builders.rosbag1 import definition_of
 from tests.builders.scans import (
     PERIOD_NS,
     START_NS,
@@ -23,10 +34,12 @@ from tests.builders.scans import (
     dense_scan,
     imu_samples,
     organized_scan,
+    point_scan,
     run_info,
     run_job,
 )
 from tests.builders.written_bags import (
+    ODD_TEXT,
     ROS1_NOTE,
     ROS1_ODD,
     ROS2_NOTE,
@@ -60,9 +73,29 @@ def recorded(name: str) -> list[Message]:
 
 
 @each_container
+def test_one_message_by_hand(name: str, tmp_path: Path) -> None:
+    encoding = "ros1" if name == "rosbag1" else "cdr"
+    found = read_back(written(name, tmp_path / OUTPUTS[name], [point_scan()]))
+    [data] = [message.raw for message in found if message.topic == "/points"]
+    body = Body(encoding)
+    if encoding == "ros1":
+        body.put("I", 0)
+    body.time(START_NS).text("base_link").put("I", 1, 1, 8)
+    fields = [("x", 0, 7), ("y", 4, 7), ("z", 8, 7), ("intensity", 12, 7), ("time", 16, 7)]
+    fields += [("ring", 20, 4), ("return_type", 22, 2), ("lidar_id", 23, 2)]
+    for field, offset, code in fields:
+        body.text(field).put("I", offset).put("B", code).put("I", 1)
+    body.put("B", 0).put("I", 24, 24)
+    body.blob(struct.pack("<fffffHBB", 1.0, 2.0, 3.0, 7.0, 0.0625, 258, 2, 1)).put("B", 1)
+    assert data == body.done()
+
+
+@each_container
 def test_other_libraries_read_every_message(name: str, tmp_path: Path) -> None:
     messages = recorded(name)
-    found = read_back(written(name, tmp_path / OUTPUTS[name], SCANS, messages))
+    target = written(name, tmp_path / OUTPUTS[name], SCANS, messages)
+    assert report_paths(target, name).scans_csv.read_text() == SUMMARY.scans_csv
+    found = read_back(target)
     assert found[0].topic == "/tf_static"
     assert [(r.topic, r.log_ns - START_NS) for r in found] == [
         ("/tf_static", -7),
@@ -172,12 +205,28 @@ def test_a_run_without_scans(name: str, tmp_path: Path) -> None:
     assert [(r.topic, r.log_ns) for r in read_back(path)] == [("/tf_static", 0)]
 
 
-@each_container
-@pytest.mark.parametrize("topic", ["/points", "/left/imu", "/tf_static"])
-def test_topics_of_the_scans_are_not_shared(name: str, topic: str, tmp_path: Path) -> None:
-    writer = open_writer(name, tmp_path / "out", run_info(), WriterOptions())
-    with pytest.raises(ExportError, match=f"than those of the scans, found {topic}; do not pass"):
-        writer.write_message(note(ROS2_NOTE._replace(name=topic), "x", 0))
+LOST = ROS1_NOTE._replace(type="my_msgs/Lost")
+REFUSED = [
+    ("rosbag1", ROS2_NOTE, "^/note: expected messages of ROS 1 .* found 'cdr'"),
+    ("rosbag2", ROS1_NOTE, r"^/note: expected messages of ROS 2 \(cdr\).*\.mcap"),
+    *(
+        ("rosbag1", LOST._replace(definition=text), "^/note: expected a definition of my_msgs/Lost")
+        for text in ("what ever this is !!", "other_msgs/Missing x\n")
+    ),
+    *(
+        (name, ROS2_NOTE._replace(name=topic), f"those of the scans, found {topic}; do not pass")
+        for name in OUTPUTS
+        for topic in ("/points", "/left/imu", "/tf_static")
+    ),
+]
+
+
+@pytest.mark.parametrize(("name", "topic", "message"), REFUSED)
+def test_messages_that_are_refused(name: str, topic: Topic, message: str, tmp_path: Path) -> None:
+    writer = open_writer(name, tmp_path / OUTPUTS[name], run_info(), WriterOptions())
+    run_job(writer.write(dense_scan()))
+    with pytest.raises(ExportError, match=message):
+        writer.write_message(note(topic, "x", 0))
     writer.abandon()
 
 
@@ -197,43 +246,6 @@ def test_messages_that_fill_the_memory_do_not_wait(name: str, tmp_path: Path) ->
     assert notes == list(range(20))
 
 
-# -- rotations ------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    ("rotation", "expected"),
-    [
-        ([[1, 0, 0], [0, 1, 0], [0, 0, 1]], (0, 0, 0, 1)),
-        ([[1, 0, 0], [0, 0, -1], [0, 1, 0]], (HALF, 0, 0, HALF)),
-        ([[0, 0, 1], [0, 1, 0], [-1, 0, 0]], (0, HALF, 0, HALF)),
-        ([[0, -1, 0], [1, 0, 0], [0, 0, 1]], (0, 0, HALF, HALF)),
-        # 180 degrees, where w is 0.
-        ([[1, 0, 0], [0, -1, 0], [0, 0, -1]], (1, 0, 0, 0)),
-        ([[-1, 0, 0], [0, 1, 0], [0, 0, -1]], (0, 1, 0, 0)),
-        ([[-1, 0, 0], [0, -1, 0], [0, 0, 1]], (0, 0, 1, 0)),
-        # x to y, y to z, z to x: 120 degrees about (1, 1, 1).
-        ([[0, 0, 1], [1, 0, 0], [0, 1, 0]], (0.5, 0.5, 0.5, 0.5)),
-    ],
-)
-def test_known_rotations(rotation: list[list[int]], expected: tuple[float, ...]) -> None:
-    assert quaternion(np.array(rotation, float)) == pytest.approx(expected)
-
-
-def test_quaternions_rotate_vectors_as_their_matrix() -> None:
-    rng = np.random.default_rng(2)
-    for _ in range(200):
-        rotation, _ = np.linalg.qr(rng.normal(size=(3, 3)))
-        rotation *= np.linalg.det(rotation)
-        *axis, w = quaternion(rotation)
-        vector = rng.normal(size=3)
-        # v + 2 w (q x v) + 2 q x (q x v)
-        once = np.cross(axis, vector)
-        rotated = vector + 2 * w * once + 2 * np.cross(axis, once)
-        np.testing.assert_allclose(rotated, rotation @ vector, atol=1e-12)
-        assert w >= 0
-        assert math.isclose(w * w + sum(part * part for part in axis), 1)
-
-
 @pytest.mark.parametrize("frame", ["base_link", "f" * 2 * PACKED_ROOM])
 def test_packed_points_become_the_message_of_arrays(frame: str) -> None:
     scan = dense_scan()
@@ -245,3 +257,94 @@ def test_packed_points_become_the_message_of_arrays(frame: str) -> None:
     cloud = CloudMessage(layout, frame, Cdr)
     from_arrays = cloud.message(scan, 5, True).tobytes()
     assert cloud.message(replace(scan, packed=packed), 5, True).tobytes() == from_arrays
+
+
+# -- one container ------------------------------------------------------------------------------
+
+
+def test_messages_of_ros_1_and_ros_2(tmp_path: Path) -> None:
+    messages = [note(ROS1_NOTE, "one", 1), note(ROS2_NOTE._replace(name="/two"), "two", 2)]
+    path = written("mcap", tmp_path / "out.mcap", [dense_scan()], messages)
+    with path.open("rb") as file:
+        found = list(make_reader(file, validate_crcs=True).iter_messages(["/note", "/two"]))
+    assert [(s.name, s.encoding, c.message_encoding) for s, c, _ in found if s is not None] == [
+        ("std_msgs/String", "ros1msg", "ros1"),
+        ("std_msgs/msg/String", "ros2msg", "cdr"),
+    ]
+    assert found[0][1].metadata == {"latching": "1"}
+    assert [m.data for _, _, m in found] == [m.data for m in messages]
+
+
+# From the message pages of docs.ros.org (noetic).
+MD5 = {
+    "/points": "1158d486dd51d683ce2f1be655c3c181",
+    "/left/imu": "6a62c6daae103f4ff57a132d6f95cec2",
+    "/right/imu": "6a62c6daae103f4ff57a132d6f95cec2",
+    "/tf_static": "94810edda583a504dfda3829e70d7eec",
+    "/note": "992ce8a1687cec8c8bd883ec73ca41d1",
+}
+
+
+def test_connections_are_what_ros_1_expects(tmp_path: Path) -> None:
+    path = written("rosbag1", tmp_path / "out.bag", SCANS, recorded("rosbag1"))
+    assert path.read_bytes().startswith(b"#ROSBAG V2.0\n")
+    with rosbag1.Reader(path) as reader:
+        connections = {c.topic: c for c in reader.connections}
+        assert reader.message_count == 9
+    assert {t: c.digest for t, c in connections.items() if t in MD5} == MD5
+    latched = {t for t, c in connections.items() if getattr(c.ext, "latching", 0)}
+    assert latched == {"/tf_static", "/note"}
+    assert definition_of(connections["/points"]).count("=" * 80) == 2
+    assert definition_of(connections["/odd"]) == ODD_TEXT
+    assert b"type=sensor_msgs/PointCloud2" in path.read_bytes()
+
+
+def test_a_type_without_fields(tmp_path: Path) -> None:
+    topic = ROS1_NOTE._replace(type="std_msgs/Empty", definition="")
+    message = Message(topic, START_NS, b"")
+    path = written("rosbag1", tmp_path / "out.bag", SCANS[:1], [message])
+    with rosbag1.Reader(path) as reader:
+        [connection] = [c for c in reader.connections if c.topic == "/note"]
+    # MD5 of no text at all.
+    assert connection.digest == "d41d8cd98f00b204e9800998ecf8427e"
+
+
+def test_qos_is_in_numbers(tmp_path: Path) -> None:
+    """Also where the recording has words: Humble reads none."""
+    folder = written("rosbag2", tmp_path / "out", SCANS[:1], recorded("rosbag2"))
+    info = yaml.safe_load((folder / "metadata.yaml").read_text())["rosbag2_bagfile_information"]
+    qos = {
+        t["topic_metadata"]["name"]: yaml.safe_load(t["topic_metadata"]["offered_qos_profiles"])
+        for t in info["topics_with_message_count"]
+    }
+    forever = {"sec": 9223372036, "nsec": 854775807}
+    for name, [profile] in qos.items():
+        latched = name in ("/tf_static", "/note")
+        assert profile == {
+            "history": 1,
+            "depth": 1 if latched else 10,
+            "reliability": 1,
+            "durability": 1 if latched else 2,
+            "deadline": forever,
+            "lifespan": forever,
+            "liveliness": 1,
+            "liveliness_lease_duration": forever,
+            "avoid_ros_namespace_conventions": False,
+        }
+    with (folder / "out_0.mcap").open("rb") as file:
+        summary = make_reader(file).get_summary()
+    assert summary is not None
+    channels = summary.channels.values()
+    inside = {c.topic: yaml.safe_load(c.metadata["offered_qos_profiles"]) for c in channels}
+    assert inside == qos
+
+
+def test_a_definition_that_was_not_stored_is_ours(tmp_path: Path) -> None:
+    """Bags of Humble contain no definitions."""
+    topic = Topic("/imu", "sensor_msgs/Imu", "cdr")
+    source = read_back(written("rosbag2", tmp_path / "first", SCANS[:1]))
+    [raw, _] = [r.raw for r in source if r.topic == "/left/imu"]
+    message = note(ROS2_NOTE, "", 5)._replace(topic=topic, data=raw)
+    found = read_back(written("rosbag2", tmp_path / "out", SCANS[:1], [message]))
+    [imu] = [r.value for r in found if r.topic == "/imu"]
+    assert imu.linear_acceleration.z == 3.0
