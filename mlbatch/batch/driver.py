@@ -14,7 +14,7 @@ from typing import Any, Protocol
 
 from mlbatch.batch.record import FAILED, SessionRecord
 from mlbatch.batch.status import SessionStatus
-from mlbatch.batch.task import Stop, Task, finished, run_session
+from mlbatch.batch.task import Task, finished, run_session
 from mlbatch.errors import (
     DiskFullError,
     ExportError,
@@ -153,7 +153,7 @@ class Threads:
 
     def __init__(self, at_once: int) -> None:
         self.at_once = at_once
-        self._stop = Stop()
+        self._stop = threading.Event()
         self._threads: list[threading.Thread] = []
 
     def begin(self, task: Task, ended: Ended) -> None:
@@ -168,7 +168,7 @@ class Threads:
 
     def close(self) -> None:
         """End the processes in order, and wait for them."""
-        self._stop.now()
+        self._stop.set()
         for thread in self._threads:
             # One that is not alive yet will find `stop`.
             if thread.is_alive():

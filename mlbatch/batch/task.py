@@ -16,9 +16,9 @@ import sys
 import threading
 import time
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import BinaryIO
 
 from mlbatch.batch.identity import CONTENT, Key, content, is_same, session_key
 from mlbatch.batch.record import (
@@ -41,8 +41,16 @@ from mlbatch.batch.session import (
     is_url,
     own_files,
 )
-from mlbatch.bounded import parse_json, read_text
-from mlbatch.errors import DiskFullError, ExportError, Interrupted, MlbatchError, one_line
+from mlbatch.bounded import read_text
+from mlbatch.errors import (
+    DiskFullError,
+    ExportError,
+    Interrupted,
+    MlbatchError,
+    RecordingError,
+    one_line,
+)
+from mlbatch.report.report import report_of
 
 # Exit codes of `convert` that another attempt would not change, and that of a limit.
 _FINAL = (0, 1, 2, 3)
@@ -111,40 +119,6 @@ def tasks_of(
     ]
 
 
-@dataclass(slots=True)
-class Stop:
-    """Ends the processes of sessions from another thread."""
-
-    event: threading.Event = field(default_factory=threading.Event)
-    _running: set[subprocess.Popen[bytes]] = field(default_factory=set)
-    _lock: threading.Lock = field(default_factory=threading.Lock)
-
-    @contextlib.contextmanager
-    def watched(self, process: subprocess.Popen[bytes]) -> Iterator[None]:
-        """End the process with `now`; it may have been called already."""
-        with self._lock:
-            self._running.add(process)
-        if self.event.is_set():
-            process.terminate()
-        try:
-            yield
-        finally:
-            with self._lock:
-                self._running.discard(process)
-
-    def now(self) -> None:
-        """Ask all processes to end in order, so that they can be resumed."""
-        self.event.set()
-        with self._lock:
-            for process in self._running:
-                process.terminate()
-
-    def check(self) -> None:
-        """Raise Interrupted after `now`."""
-        if self.event.is_set():
-            raise Interrupted("interrupted")
-
-
 def finished(task: Task) -> SessionRecord | None:
     """The record of a session whose inputs, options and versions did not change since."""
     record = read_record(task.upload or task.folder)
@@ -156,14 +130,15 @@ def finished(task: Task) -> SessionRecord | None:
     return record if is_current else None
 
 
-def run_session(task: Task, stop: Stop | None = None) -> SessionRecord:
+def run_session(task: Task, stop: threading.Event | None = None) -> SessionRecord:
     """Convert a session and write its session.json.
 
-    Raises Interrupted where `stop` ended it, ExportError where the folder cannot be used;
-    DiskFullError where it has no space: the session is unfinished, and can be resumed.
+    stop: ends its process in order, so that it can be resumed. Raises Interrupted where it did,
+    ExportError where the folder cannot be used; DiskFullError where it has no space: the session is
+    unfinished, and can be resumed.
     """
     try:
-        return _run_session(task, stop or Stop())
+        return _run_session(task, stop or threading.Event())
     except (MlbatchError, OSError) as err:
         if isinstance(err, Interrupted) or not _is_full(task.folder, str(err)):
             raise
@@ -190,10 +165,15 @@ def _disk_full(folder: Path) -> DiskFullError:
     )
 
 
-def _run_session(task: Task, stop: Stop) -> SessionRecord:
+def _check(stop: threading.Event) -> None:
+    if stop.is_set():
+        raise Interrupted("interrupted")
+
+
+def _run_session(task: Task, stop: threading.Event) -> SessionRecord:
     session = task.session
     began_s = time.monotonic()
-    stop.check()
+    _check(stop)
     try:
         key = session_key(session, task.cwd)
     except MlbatchError as err:
@@ -272,7 +252,7 @@ def _publish(task: Task, record: SessionRecord) -> None:
 
 
 @contextlib.contextmanager
-def _locked(folder: Path, stop: Stop) -> Iterator[BinaryIO]:
+def _locked(folder: Path, stop: threading.Event) -> Iterator[BinaryIO]:
     """The log of a session, open and locked.
 
     The process of the session inherits the lock, so that it ends with the last of both.
@@ -290,8 +270,8 @@ def _locked(folder: Path, stop: Stop) -> Iterator[BinaryIO]:
                         f"{folder}: expected no other run of this session, found one; wait for its "
                         "end"
                     ) from err
-                stop.event.wait(_POLL_S)
-                stop.check()
+                stop.wait(_POLL_S)
+                _check(stop)
             except OSError:
                 # Some network file systems have no locks.
                 break
@@ -325,19 +305,19 @@ def _clear(folder: Path, kept: Sequence[str]) -> None:
             path.unlink(missing_ok=True)
 
 
-def _attempts(task: Task, log: BinaryIO, stop: Stop) -> tuple[int, int]:
+def _attempts(task: Task, log: BinaryIO, stop: threading.Event) -> tuple[int, int]:
     """Run the process until it ends; exit code and number of attempts."""
     attempts = 0
     while True:
         attempts += 1
         log.truncate(0)
         code = _run(words_of(task), task, log, stop)
-        stop.check()
+        _check(stop)
         if code in _FINAL or attempts > task.retries:
             return code, attempts
 
 
-def _run(words: list[str], task: Task, log: BinaryIO, stop: Stop) -> int:
+def _run(words: list[str], task: Task, log: BinaryIO, stop: threading.Event) -> int:
     process = subprocess.Popen(
         [sys.executable, "-m", "mlbatch.cli.child", *words],
         stdin=subprocess.PIPE,
@@ -346,15 +326,17 @@ def _run(words: list[str], task: Task, log: BinaryIO, stop: Stop) -> int:
         cwd=task.cwd,
         start_new_session=True,
     )
-    with stop.watched(process):
-        try:
-            return process.wait()
-        finally:
-            if process.stdin is not None:
-                process.stdin.close()
+    with process:
+        while process.poll() is None and not stop.is_set():
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                process.wait(_POLL_S)
+        if stop.is_set():
+            # Once, since a second signal ends it at any place.
+            process.terminate()
+        return process.wait()
 
 
-def _add_page(task: Task, code: int, log: BinaryIO, stop: Stop) -> None:
+def _add_page(task: Task, code: int, log: BinaryIO, stop: threading.Event) -> None:
     """Write the page of a run that was killed after its output and before its page."""
     output = task.folder / task.session.output
     is_there = any(path.name.startswith("page") for path in own_files(task.folder))
@@ -405,30 +387,25 @@ def _ended(code: int) -> str:
 
 def _add_figures(record: SessionRecord, folder: Path) -> None:
     """Sizes of inputs and outputs, and counts of the reports."""
-    fills = []
+    reports = []
     for path in own_files(folder):
         if path.name.startswith("scans"):
             record.outputs.append(path.name)
             files = [path] if path.is_file() else path.iterdir()
             record.output_bytes += sum(one.stat().st_size for one in files if one.is_file())
         elif path.name.startswith("report") and path.suffix == ".json":
-            with contextlib.suppress(OSError, ValueError, KeyError, TypeError):
-                fills += _add_report(record, parse_json(read_text(path)))
-    record.fill = min(fills, default=None)
-
-
-def _add_report(record: SessionRecord, report: dict[str, Any]) -> list[float]:
-    """Add the counts of a report; the fill of its sensors."""
-    record.input_bytes = sum(one["bytes"] for one in report["inputs"])
-    record.recorded_s += report["timing"]["recorded_s"]
-    record.scans += report["scans"]["written"]
-    record.points += report["scans"]["points"]
-    record.incomplete += report["scans"]["incomplete"]
-    for sensor in report["sensors"]:
-        packets = sensor["packets"]
-        record.packets += packets["read"]
-        record.lost += packets["lost"]
-        record.rejected += sum(packets["rejected"].values())
-    codes = {one["code"] for one in report["warnings"]}
-    record.warnings = sorted({*record.warnings, *codes})
-    return [sensor["fill"] for sensor in report["sensors"] if sensor["fill"] is not None]
+            with contextlib.suppress(OSError, ValueError, RecordingError):
+                reports.append(report_of(path, read_text(path)))
+    for report in reports:
+        record.input_bytes = sum(one.bytes for one in report.inputs)
+        record.recorded_s += report.recorded_s
+        record.scans += report.scans.written
+        record.points += report.scans.points
+        record.incomplete += report.scans.incomplete
+    sensors = [sensor for report in reports for sensor in report.sensors]
+    for packets in (sensor.ledger.packets for sensor in sensors):
+        record.packets += packets.read
+        record.lost += packets.lost
+        record.rejected += sum(packets.rejected.values())
+    record.fill = min((one.fill for one in sensors if one.fill is not None), default=None)
+    record.warnings = sorted({one.code for report in reports for one in report.warnings})
