@@ -19,7 +19,7 @@ from tests.builders.livox import LivoxSpec
 from tests.builders.others import EE, filled
 from tests.builders.points import CLOUD, OUSTER, cloud_message
 from tests.builders.rosbag2 import write_rosbag2
-from tests.builders.sessions import NS_PER_S, Report, Shell, report_of, write_metadata
+from tests.builders.sessions import NS_PER_S, Shell, write_metadata
 from tests.builders.transcripts import transcripts
 from tests.builders.vendor_sessions import (
     BEGIN_NS,
@@ -203,116 +203,8 @@ def _write_others(folder: Path) -> None:
     write_rosbag2(folder / "both.db3", raw + clouds)
 
 
-@pytest.fixture
-def shell(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], place: Path
-) -> Shell:
-    monkeypatch.chdir(place)
-    return Shell(monkeypatch, capsys)
-
-
 @pytest.mark.parametrize("name", VENDOR_MISTAKES)
-def test_mistake_with_a_maker(shell: Shell, place: Path, name: str) -> None:
-    VENDOR_MISTAKES[name].check(shell, place)
-
-
-def _converted(shell: Shell, arguments: str, folder: Path) -> Report:
-    """Report of a run that works."""
-    outcome = shell(f"convert {arguments} --keep-partial -o {folder / 'out'}")
-    assert outcome.code == 0, outcome.err
-    return report_of(str(folder / "out" / "report.json"))
-
-
-def _warnings(report: Report) -> list[tuple[str, str]]:
-    return [(one["sensor"], one["message"]) for one in report["warnings"]]
-
-
-def test_device_packets_on_the_topic_of_the_points_give_angles(
-    shell: Shell, tmp_path: Path
-) -> None:
-    report = _converted(shell, "helios.db3", tmp_path)
-    (sensor,) = report["sensors"]
-    assert sensor["calibration"] == "DIFOP packets of 0a1b2c3d4e5f"
-    assert sensor["packets"]["accepted"] == MANY
-    assert [one["packets"] for one in report["unassigned"]] == [4]
-
-
-def test_a_rig_may_name_a_model_that_packets_do_not(shell: Shell, tmp_path: Path) -> None:
-    report = _converted(shell, "vlp16/drive.pcap --rig lite.yaml", tmp_path)
-    assert report["sensors"][0]["model"] == "Puck LITE"
-    assert _warnings(report) == []
-
-
-def test_a_rig_that_names_another_model_than_packets_is_told(shell: Shell, tmp_path: Path) -> None:
-    rig = tmp_path / "hires.yaml"
-    rig.write_text("sensors: [{name: top, model: Puck Hi-Res}]\n", encoding="utf-8")
-    report = _converted(shell, f"vlp16/drive.pcap --rig {rig}", tmp_path)
-    assert report["sensors"][0]["model"] == "Puck Hi-Res"
-    text = "read as Puck Hi-Res, which the rig names; it looks like Velodyne lidar VLP-16,"
-    assert _warnings(report) == [("top", f"{text} strongest return")]
-
-
-def test_a_rig_chooses_the_lidar_of_its_model(shell: Shell, tmp_path: Path) -> None:
-    """Though another one fits as well, and comes first."""
-    report = _converted(shell, "pair/drive.pcap --rig vlp16.yaml", tmp_path)
-    (sensor,) = report["sensors"]
-    assert (sensor["model"], sensor["stream"]) == ("VLP-16", f"{IP} > port {PORT}")
-
-
-def test_packets_of_another_size_are_told_and_counted(shell: Shell, tmp_path: Path) -> None:
-    report = _converted(shell, "p40/drive.pcap", tmp_path)
-    (sensor,) = report["sensors"]
-    assert sensor["packets"]["rejected"] == {"bad_size": MANY}
-    (name, text), (same, counted) = _warnings(report)
-    assert name == same == "hesai_1"
-    assert counted == (
-        f"hesai_1: {MANY} of {2 * MANY} packets rejected ({MANY} bad_size): their size is not that "
-        "of the first packets"
-    )
-    assert text == (
-        f"{IP} > port {PORT}: expected packets of 1262 bytes as at first, found 1266 bytes as "
-        "well, which are rejected as bad_size; split the recording where the settings of the lidar "
-        "change"
-    )
-
-
-@pytest.mark.parametrize("session", ["changed", "xt16_changed"])
-def test_packets_of_another_return_mode_are_rejected(
-    shell: Shell, tmp_path: Path, session: str
-) -> None:
-    report = _converted(shell, f"{session}/drive.pcap", tmp_path)
-    assert report["sensors"][0]["packets"]["rejected"] == {"bad_header": MANY}
-    assert report["sensors"][0]["packets"]["accepted"] == MANY
-    ((_, text),) = _warnings(report)
-    assert text.endswith(
-        f"{MANY} of {2 * MANY} packets rejected ({MANY} bad_header): their model or mode is not "
-        "that of the first packets"
-    )
-
-
-def test_metadata_that_fit_nothing_are_told(shell: Shell, tmp_path: Path) -> None:
-    for session, path in (("vlp32c/drive.pcap", "vlp16.yml"), ("clouds.db3", "xt16.csv")):
-        folder = tmp_path / path
-        folder.mkdir()
-        text = _warnings(_converted(shell, f"{session} --metadata files/{path}", folder))
-        unused = "it is not used; leave it out, or name its sensor in a rig file (--rig)"
-        assert (
-            "",
-            f"files/{path}: expected a sensor that it matches, found none; {unused}",
-        ) in text
-
-
-def test_clouds_beside_raw_packets_are_left_alone(shell: Shell, tmp_path: Path) -> None:
-    report = _converted(shell, "both.db3", tmp_path)
-    assert [one["model"] for one in report["sensors"]] == ["Helios 16"]
-    assert report["warnings"] == []
-
-
-def test_a_lidar_of_the_rig_that_begins_late_joins_by_its_model(
-    shell: Shell, tmp_path: Path
-) -> None:
-    report = _converted(shell, "silent/drive.pcap --rig silent_vlp16.yaml", tmp_path)
-    accepted = {one["name"]: one["packets"]["accepted"] for one in report["sensors"]}
-    assert accepted == {"left": 125 * 32, "top": FEW}
-    codes = {one["code"] for one in report["warnings"]}
-    assert "not_seen_yet" in codes
+def test_mistake_with_a_vendor(shell: Shell, place: Path, tmp_path: Path, name: str) -> None:
+    for path in place.iterdir():
+        (tmp_path / path.name).symlink_to(path)
+    VENDOR_MISTAKES[name].check(shell, tmp_path)

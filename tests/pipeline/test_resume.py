@@ -321,21 +321,6 @@ def test_copies_and_other_versions_make_the_same_output(
     assert "is complete" in shell(f"convert {capture} -o out --resume").err
 
 
-def test_another_recording_calibration_or_pose_is_refused(shell: Shell, tmp_path: Path) -> None:
-    capture = write_session(tmp_path / "in", Unit(turns=8))
-    words = f"{capture} -o out"
-    _interrupt(shell, words)
-    os.utime(capture, ns=(1, 1))
-    assert "found recording 1 'drive.pcap (" in shell(f"convert {words} --resume").err
-    _interrupt(shell, words)
-    metadata = tmp_path / "in" / "111.json"
-    found = json.loads(metadata.read_text())
-    angles = found["beam_intrinsics"]["beam_altitude_angles"]
-    angles[0] += 0.01
-    metadata.write_text(json.dumps(found))
-    assert "found calibration of ouster_111 '" in shell(f"convert {words} --resume").err
-
-
 # Revolutions of 0.8 MB: samples are 0.1 MB apart.
 LARGE = replace(SMALL, beams=128)
 
@@ -356,19 +341,73 @@ def _unsampled(size: int, near: float) -> int:
     return next(one for one in range(at, size) if not any(one in part for part in sampled))
 
 
-def test_a_recording_with_another_sample_is_refused(shell: Shell, tmp_path: Path) -> None:
-    capture = write_session(tmp_path / "in", Unit(LARGE, turns=8))
-    size = capture.stat().st_size
-    words = f"{capture} -o out"
-    middle = next(at for at, _ in job_identity._sampled(size, size) if at > size // 2)
-    for at in (100, middle, size - 100):
-        _interrupt(shell, words)
-        _flip(capture, at)
-        outcome = shell(f"convert {words} --resume")
-        assert outcome.code == 2
-        assert "expected the job of the interrupted run, found recording 1 'drive." in outcome.err
-        _flip(capture, at)
-    assert shell(f"convert {words} --resume").code == 0
+def _flipped(at: Callable[[bytes], int]) -> Callable[[bytes], bytes]:
+    """Change of a bit; at: which byte."""
+
+    def change(content: bytes) -> bytes:
+        place = at(content)
+        return content[:place] + bytes([content[place] ^ 4]) + content[place + 1 :]
+
+    return change
+
+
+def _replaced(before: bytes, after: bytes) -> Callable[[bytes], bytes]:
+    return lambda content: content.replace(before, after, 1)
+
+
+def _middle_sample(content: bytes) -> int:
+    size = len(content)
+    return next(at for at, _ in job_identity._sampled(size, size) if at > size // 2)
+
+
+def _angle_moved(content: bytes) -> bytes:
+    metadata = json.loads(content)
+    metadata["beam_intrinsics"]["beam_altitude_angles"][0] += 0.01
+    return json.dumps(metadata).encode()
+
+
+# What is converted, a file of it that changes, but not its time; None: the time alone.
+CHANGES: list[tuple[str, str, Callable[[bytes], bytes] | None, str]] = [
+    ("small", "drive.pcap", None, "recording 1 'drive.pcap ("),
+    ("large", "drive.pcap", _flipped(lambda _: 100), "recording 1 'drive."),
+    ("large", "drive.pcap", _flipped(_middle_sample), "recording 1 'drive."),
+    ("large", "drive.pcap", _flipped(lambda content: len(content) - 100), "recording 1 'drive."),
+    ("small", "111.json", _angle_moved, "calibration of ouster_111 '"),
+    # Also a byte without influence: the file is not the same.
+    (
+        *("small", "111.json"),
+        _flipped(lambda content: content.index(b"calibration_status") + 3),
+        "calibration of ouster_111 '",
+    ),
+    ("rig", "rig.yaml", _replaced(b"translation_m: [", b"translation_m: [1"), ""),
+    ("rig", "rig.yaml", _replaced(b"exclude_boxes_m: [[-1.7", b"exclude_boxes_m: [[-1.8"), ""),
+]
+
+
+@pytest.mark.parametrize(("kind", "name", "change", "found"), CHANGES)
+def test_another_input_is_refused(
+    shell: Shell, kind: str, name: str, change: Callable[[bytes], bytes] | None, found: str
+) -> None:
+    if kind == "rig":
+        shutil.copytree(FIXTURE, "in")
+        words = "in/two_lidars.pcap --rig in/rig.yaml -o out"
+    else:
+        unit = Unit(LARGE if kind == "large" else SMALL, turns=8)
+        words = f"{write_session(Path('in'), unit)} -o out"
+    _interrupt(shell, words)
+    path = Path("in", name)
+    sound = path.read_bytes()
+    times = path.stat().st_atime_ns, path.stat().st_mtime_ns
+    path.write_bytes(sound if change is None else change(sound))
+    assert (path.read_bytes() == sound) == (change is None)
+    os.utime(path, ns=(1, 1) if change is None else times)
+    refused = shell(f"convert {words} --resume")
+    assert refused.code == 2
+    assert f"expected the job of the interrupted run, found {found}" in refused.err
+    # Comments of a rig have no influence.
+    path.write_bytes(b"# The rig.\n" * (kind == "rig") + sound)
+    os.utime(path, ns=times)
+    assert shell(f"convert {words} --resume").err == "mlbatch: out: resumed after 3 scans\n"
 
 
 def test_other_packets_in_finished_scans_are_refused(shell: Shell, tmp_path: Path) -> None:
@@ -422,42 +461,6 @@ def test_another_forwarded_message_is_refused(shell: Shell, tmp_path: Path) -> N
     outcome = shell(f"convert {case} --resume")
     assert outcome.code == 2
     assert "expected the packets of the interrupted run" in outcome.err
-
-
-def test_another_byte_of_a_calibration_is_refused(shell: Shell, tmp_path: Path) -> None:
-    """Also one without influence: the file is not the same."""
-    capture = write_session(tmp_path / "in", Unit(turns=8))
-    _interrupt(shell, f"{capture} -o out")
-    metadata = tmp_path / "in" / "111.json"
-    _flip(metadata, metadata.read_bytes().index(b"calibration_status") + 3)
-    assert "found calibration of ouster_111 '" in shell(f"convert {capture} -o out --resume").err
-
-
-@pytest.mark.parametrize(
-    ("before", "after"),
-    [
-        ("translation_m: [", "translation_m: [1"),
-        ("exclude_boxes_m: [[-1.7", "exclude_boxes_m: [[-1.8"),
-    ],
-)
-def test_another_rig_of_the_same_time_is_refused(
-    shell: Shell, tmp_path: Path, before: str, after: str
-) -> None:
-    shutil.copytree(FIXTURE, tmp_path / "in")
-    rig = tmp_path / "in" / "rig.yaml"
-    words = f"{tmp_path / 'in' / 'two_lidars.pcap'} --rig {rig} -o out"
-    _interrupt(shell, words)
-    times = rig.stat()
-    sound = rig.read_text()
-    rig.write_text(sound.replace(before, after, 1))
-    os.utime(rig, ns=(times.st_atime_ns, times.st_mtime_ns))
-    assert rig.read_text() != sound
-    outcome = shell(f"convert {words} --resume")
-    assert outcome.code == 2
-    assert "expected the job of the interrupted run, found " in outcome.err
-    # Comments have no influence.
-    rig.write_text(f"# The rig.\n{sound}")
-    assert shell(f"convert {words} --resume").err == "mlbatch: out: resumed after 3 scans\n"
 
 
 CHANGED = "expected the bytes that the interrupted run has written, found"
