@@ -12,15 +12,17 @@ import jsonschema
 import pytest
 import yaml
 
+from mlbatch.errors import RigError
 from mlbatch.rig.rig import read_rig
 from mlbatch.rig.schema import rig_schema
 from tests.builders.sessions import REPOSITORY, Shell
-from tests.rig.test_mistakes import VALID
+from tests.rig.test_convert_keys import MISTAKES as CONVERT_MISTAKES
+from tests.rig.test_convert_keys import SENSORS
+from tests.rig.test_mistakes import MISTAKES, VALID, one
 from tests.rig.test_rig import FULL
 
 PAGES = (REPOSITORY / "README.md", *sorted((REPOSITORY / "docs").rglob("*.md")))
 BLOCK = re.compile(r"^ *```(\w*)[^\n]*\n(.*?)^ *```$", re.MULTILINE | re.DOTALL)
-ONE = "sensors: [{name: a, %s}]"
 
 
 class Loader(yaml.SafeLoader):
@@ -38,10 +40,6 @@ def _errors(text: str) -> list[str]:
     validator = jsonschema.Draft202012Validator(rig_schema())
     values = yaml.load(text, Loader)
     return [f"{one.json_path}: {one.message}" for one in validator.iter_errors(values)]
-
-
-def _is_valid(text: str) -> bool:
-    return not _errors(text)
 
 
 def _blocks() -> list[str]:
@@ -96,51 +94,27 @@ def test_written_rigs_are_valid(shell: Shell, name: str) -> None:
     assert _errors(outcome.out) == []
 
 
-# Refused by the reader and by the schema: what is wrong, in a word.
-WRONG = (
-    "rate_hz: 10",
-    "sensors: []",
-    "[1]",
-    "sensors: [{name: a}]\nrate: 10",
-    "sensors: [{name: a}]\nrate_hz: fast",
-    "sensors: [{name: a}]\nbody_frame: a b",
-    "sensors: [{name: a}]\nexclude_boxes_m: [[0, 0, 0, 1, 1]]",
-    "sensors: [{name: a}]\nconvert: {job: 4}",
-    "sensors: [{name: a}]\nconvert: {jobs: 0}",
-    "sensors: [{name: a}]\nconvert: {jobs: 1.5}",
-    "sensors: [{name: a}]\nconvert: {split: 1}",
-    "sensors: [{name: a}]\nconvert: {layout: flat}",
-    "sensors: [{name: a}]\nconvert: {drop_incomplete: 101}",
-    "sensors: [{name: a}]\nconvert: {only: {a: b}}",
-    "sensors: [{model: auto}]",
-    "sensors: [{name: 1a}]",
-    ONE % "stream: {}",
-    ONE % "stream: {ip: 10.0.0.1}",
-    ONE % "stream: {port: 0}",
-    ONE % "stream: {port: 70000}",
-    ONE % "stream: {topic: /a, port: 7502}",
-    ONE % "stream: {frame_id: os_left}",
-    ONE % "extrinsics: known",
-    ONE % "extrinsics: {}",
-    ONE % "extrinsics: {translation_m: [1, 2]}",
-    ONE % "extrinsics: {rotation_rpy_deg: [0, 0, 0], rotation_xyzw: [0, 0, 0, 1]}",
-    ONE % "extrinsics: {matrix: [[1, 0, 0, 0]]}",
-    ONE % "extrinsics: {frame: os_left, translation_m: [1, 2, 3]}",
-    ONE % "clock: {source: gps}",
-    ONE % "clock: {offset_s: 5000000000}",
-    ONE % "min_range_m: -1",
-    ONE % "min_range_m: near",
-    ONE % "optional: maybe",
-    ONE % "points: {unit: m}",
-    ONE % "decode: [crc]",
+# Mistakes that only the reader finds: in YAML, between keys, in values.
+BEYOND = (
+    *("expected YAML", "control character", "one document", "a word as key", "plain values"),
+    *("each key once", "of its own", "not the body frame", "existing file", "more than 5 m"),
+    *("0.25 to", "a sensor on a topic", "an IP address", "'.nan'", "'-.inf'", "'1e999'"),
+    *("at most 10000 m", "quaternion of norm", "orthonormal", "determinant", "as last row"),
+    "y0 < y1",
 )
+REFUSED = [
+    *(text for text, message in MISTAKES if not any(words in message for words in BEYOND)),
+    *(SENSORS + section for section, _ in CONVERT_MISTAKES),
+    SENSORS + "convert: {jobs: 1.5}\n",
+    one("extrinsics: known"),
+    one("stream: {port: 0}"),
+    one("clock: {offset_s: 5000000000}"),
+]
 
 
-@pytest.mark.parametrize("text", WRONG)
-def test_wrong_rigs_are_neither_valid_nor_read(tmp_path: Path, text: str) -> None:
-    from mlbatch.errors import RigError
-
-    assert not _is_valid(text)
+@pytest.mark.parametrize("text", REFUSED)
+def test_what_the_reader_refuses_is_not_valid(tmp_path: Path, text: str) -> None:
+    assert _errors(text)
     file = tmp_path / "rig.yaml"
     file.write_text(text)
     with pytest.raises(RigError):
