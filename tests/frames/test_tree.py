@@ -142,22 +142,17 @@ def test_two_parents_above_both_frames_do_not_matter() -> None:
 def test_circles_are_refused_in_any_order(first: int) -> None:
     circle = [_edge("a", "b"), _edge("b", "c"), _edge("c", "a")]
     tree = _tree(*circle[first:], *circle[:first], _edge("c", "lidar", (1.0, 0.0, 0.0)))
-    with pytest.raises(RigError, match="expected frames that form a tree, found the circle"):
+    with pytest.raises(RigError) as caught:
         tree.chain("a", "b")
+    # From parent to child.
+    assert str(caught.value) == (
+        "tf_static: expected frames that form a tree, found the circle b -> c -> a -> b; "
+        "give the extrinsics in a rig file (--rig)"
+    )
     with pytest.raises(RigError, match="circle"):
         tree.chain("a", "lidar")
     # Frames below the circle keep their transforms up to it.
     assert _moved(tree, "c", "lidar", (0, 0, 0)) == [1, 0, 0]
-
-
-def test_the_text_of_a_circle() -> None:
-    tree = _tree(_edge("a", "b"), _edge("b", "a"))
-    with pytest.raises(RigError) as caught:
-        tree.chain("a", "b")
-    assert str(caught.value) == (
-        "tf_static: expected frames that form a tree, found the circle b -> a -> b; "
-        "give the extrinsics in a rig file (--rig)"
-    )
 
 
 @pytest.mark.parametrize(
@@ -167,8 +162,6 @@ def test_the_text_of_a_circle() -> None:
         ("a", "b", (math.inf, 0, 0), NO_ROTATION, "expected 3 finite metres, found inf, 0, 0"),
         ("a", "b", (0, 0), NO_ROTATION, "expected 3 finite metres, found 0, 0"),
         ("a", "b", (0, 0, 0), (0, 0, 0, 0), "expected a quaternion of norm 1 within 0.001, found"),
-        ("a", "b", (0, 0, 0), (0, 0, 0, 1.002), "norm 1.002"),
-        ("a", "b", (0, 0, 0), (0, 0, math.nan, 1), "norm nan"),
         ("a", "/a", (0, 0, 0), NO_ROTATION, "expected two frames, found the same twice"),
         ("/", "b", (0, 0, 0), NO_ROTATION, "expected two frames, found an empty name"),
         ("a", " ", (0, 0, 0), NO_ROTATION, "expected two frames, found an empty name"),
@@ -183,11 +176,6 @@ def test_edges_that_are_none(
     assert text.startswith("tf_static: transform ")
     assert expected in text
     assert "\n" not in text
-
-
-def test_a_quaternion_is_normalised_within_a_thousandth() -> None:
-    edge = _edge("a", "b", xyzw=(0.0, 0.0, 0.0, 1.0009))
-    assert np.array_equal(edge.matrix, np.eye(4))
 
 
 def test_of_several_sources_the_first_wins_by_child() -> None:
@@ -259,14 +247,6 @@ def test_chains_compose_and_invert(tree: FrameTree, data: st.DataObject) -> None
     a_from_c = _matrix(tree, a, c)
     assert np.allclose(_matrix(tree, a, b) @ _matrix(tree, b, c), a_from_c, atol=1e-9)
     assert np.allclose(a_from_c @ _matrix(tree, c, a), np.eye(4), atol=1e-9)
-
-
-@given(_trees(), st.data())
-def test_chains_keep_distances(tree: FrameTree, data: st.DataObject) -> None:
-    a, b = (data.draw(st.sampled_from(tree.frames)) for _ in range(2))
-    p, q = (data.draw(st.tuples(*[LENGTHS] * 3)) for _ in range(2))
-    there = [_moved(tree, a, b, point) for point in (p, q)]
-    assert math.dist(*there) == pytest.approx(math.dist(p, q), abs=1e-9)
 
 
 @given(_trees(), st.data())

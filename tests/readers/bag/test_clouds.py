@@ -128,15 +128,6 @@ def test_rings_beyond_those_of_the_first_cloud_are_reported(tmp_path: Path) -> N
     assert fault.endswith("the first: expected rings as in the first cloud, found none")
 
 
-def test_each_pass_starts_anew(tmp_path: Path) -> None:
-    recording, _ = _open(_bag(tmp_path, write_points("/points", [_sweep(n) for n in range(5)])))
-    packets = recording.packets()
-    assert len(_payloads(iter([next(packets)]))) > 0
-    packets.close()
-    assert len(_payloads(recording.packets())) == 15
-    assert (recording.counts.frames, recording.counts.datagrams) == (15, 15)
-
-
 @needs_native
 def test_a_search_for_sensors_packs_first_points_and_the_run_all(tmp_path: Path) -> None:
     """By hand: 256 columns of 16 rings, by column; 512 points are 32 columns."""
