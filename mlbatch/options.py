@@ -436,3 +436,9 @@ CONVERT: Final = (
     ),
 )
 BY_NAME: Final = {option.name: option for option in CONVERT}
+# Those that a batch passes on; the others are its own, or have no meaning for many sessions.
+_NOT_PASSED = (
+    *("output", "rig", "jobs", "only", "overwrite", "resume", "quiet", "verbose"),
+    *("report", "html", "dry_run", "shard"),
+)
+BATCH: Final = tuple(option for option in CONVERT if option.name not in _NOT_PASSED)

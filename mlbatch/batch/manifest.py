@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 
+from mlbatch import options
 from mlbatch.batch.session import Option, Session, check_name, check_unique, is_url, read_rig
 from mlbatch.errors import RecordingError, UsageError
 from mlbatch.readers.datasets import BAG_METADATA
@@ -27,9 +28,10 @@ _DOCUMENTS = re.compile(r".*\.(json|ya?ml|csv|dat|tum|txt|md|log|html)", re.IGNO
 # Names that a message shows.
 _SHOWN = 5
 _WILD = re.compile(r"[*?\[]")
-
-# Options of `convert` by name without dashes: flag, value or list.
-OptionKinds = Mapping[str, str]
+# Options of `convert` that a manifest may have: of the batch, `--only` names sessions.
+_OPTIONS = {one.name: one for one in options.BATCH} | {
+    name: options.BY_NAME[name] for name in ("only", "jobs")
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,7 +67,6 @@ def _nothing(text: str) -> None: ...
 def sessions_of(
     sources: Sequence[str],
     given: Common,
-    kinds: OptionKinds,
     say: Callable[[str], None] = _nothing,
 ) -> tuple[Session, ...]:
     """The sessions of manifests and patterns in their order.
@@ -77,7 +78,7 @@ def sessions_of(
     found: list[Session] = []
     for source in sources:
         if source.lower().endswith((".yaml", ".yml")) and not is_url(source):
-            found += _of_manifest(Path(source), given, kinds, say)
+            found += _of_manifest(Path(source), given, say)
         else:
             found += _of_pattern(source, "{stem}", given, source, say)
     check_unique(found)
@@ -182,20 +183,18 @@ def _named(template: str, match: str) -> str:
 # -- manifests --------------------------------------------------------------------------------
 
 
-def _of_manifest(
-    path: Path, given: Common, kinds: OptionKinds, say: Callable[[str], None]
-) -> Iterator[Session]:
+def _of_manifest(path: Path, given: Common, say: Callable[[str], None]) -> Iterator[Session]:
     root = read_yaml(path).fields(_KEYS, ("schema", "sessions"))
     root["schema"].choice((SCHEMA,))
-    options = _options(root.get("options"), kinds)
-    mine = {option.name.removeprefix("--"): option for option in given.options}
+    of_all = _options(root.get("options"))
+    mine = {option.name[2:].replace("-", "_"): option for option in given.options}
     nodes = root["sessions"].elements("sessions")
     if not nodes:
         raise root["sessions"].error("a list of sessions", "an empty one", "add one")
     for node in nodes:
         entries = node.fields(_SESSION_KEYS)
-        own = _options(entries.get("options"), kinds)
-        common = replace(given, options=_joined(options, own, mine))
+        own = _options(entries.get("options"))
+        common = replace(given, options=_joined(of_all, own, mine))
         rig = entries.get("rig", root.get("rig"))
         if given.rig is None and rig is not None:
             _check_fields(_text(rig), rig)
@@ -242,28 +241,20 @@ def _path(node: Node) -> str:
     return f"{node.file.parent / text}{slash}"
 
 
-def _options(node: Node | None, kinds: OptionKinds) -> dict[str, Option | None]:
+def _options(node: Node | None) -> dict[str, Option | None]:
     """Options of `convert`, named with `_` or `-`; None: a flag that is false."""
     if node is None or node.is_null():
         return {}
-    names = {name.replace("-", "_"): name for name in kinds}
-    written = {key: key.replace("-", "_") for key in node.entries}
-    for key, plain in written.items():
-        if plain not in names:
-            node.fields(tuple(names))
-            raise node.entries[key].error("another option", key, "remove it")
-    return {
-        names[plain]: _option(node.entries[key], f"--{names[plain]}", kinds[names[plain]])
-        for key, plain in written.items()
-    }
+    entries = {name.replace("-", "_"): value for name, value in node.entries.items()}
+    found = node._replace(entries=entries).fields(tuple(_OPTIONS))
+    return {name: _option(value, _OPTIONS[name]) for name, value in found.items()}
 
 
-def _option(node: Node, name: str, kind: str) -> Option | None:
-    if kind == "flag":
-        return Option(name) if node.flag() else None
-    if kind == "list" and node.kind == "list":
-        return Option(name, tuple(_text(one) for one in node.items))
-    return Option(name, (_text(node),))
+def _option(node: Node, option: options.Option) -> Option | None:
+    if option.kind == options.FLAG:
+        return Option(option.long) if node.flag() else None
+    is_list = option.kind in (options.TEXTS, options.PATHS) and node.kind == "list"
+    return Option(option.long, tuple(map(_text, node.items if is_list else (node,))))
 
 
 def _joined(*several: Mapping[str, Option | None]) -> tuple[Option, ...]:

@@ -20,12 +20,6 @@ if TYPE_CHECKING:
     from mlbatch.batch.session import Option
     from mlbatch.batch.status import SessionStatus
 
-# Options of `convert` that a batch has itself, or that have no meaning for many sessions.
-_OWN = ("output", "rig", "jobs", "only", "overwrite", "resume", "quiet", "verbose")
-_WITHOUT = (*_OWN, "report", "html", "dry_run", "shard")
-# Those that are passed to every session, by their names as parameters.
-_FORWARDED = {parameter(one).name: one for one in options.CONVERT if one.name not in _WITHOUT}
-
 
 def batch(
     context: typer.Context,
@@ -106,7 +100,7 @@ def batch(
     if rig is not None and not is_url(rig):
         # A mistake in it would fail every session.
         read_rig(Path(rig))
-    sessions = chosen(sessions_of(sources, given, _kinds(), say), only or (), numbers)
+    sessions = chosen(sessions_of(sources, given, say), only or (), numbers)
     with interruptible():
         tasks = tasks_of(
             *(sessions, output, (cache or default_cache()).absolute()),
@@ -133,16 +127,6 @@ def batch(
 # -- options of `convert` ---------------------------------------------------------------------
 
 
-def _kinds() -> dict[str, str]:
-    """Options that a manifest may have, by name without dashes."""
-    kinds = {options.FLAG: "flag", options.TEXTS: "list", options.PATHS: "list"}
-    found = {
-        one.long.removeprefix("--"): kinds.get(one.kind, "value") for one in _FORWARDED.values()
-    }
-    # `--only` of the batch names sessions.
-    return found | {"only": "list", "jobs": "value"}
-
-
 def _jobs(asked: str | None, workers: int) -> str | None:
     """Jobs of each session; None: as `convert` decides, or its rig."""
     from mlbatch.writers import parse_jobs
@@ -162,7 +146,7 @@ def _given(context: typer.Context, given: dict[str, Any], jobs: str | None) -> I
         source = context.get_parameter_source(name)
         if source is None or source.name == "DEFAULT":
             continue
-        long_name = _FORWARDED[name].long
+        long_name = options.BY_NAME[name.rstrip("_")].long
         if isinstance(value, bool):
             yield Option(long_name)
         else:
@@ -181,7 +165,7 @@ def _check_counts(**counts: int) -> None:
             raise UsageError(f"--{name}: expected {least} to 1000, found {count}; correct it")
 
 
-with_parameters(batch, map(parameter, _FORWARDED.values()))
+with_parameters(batch, map(parameter, options.BATCH))
 
 
 # -- output -----------------------------------------------------------------------------------

@@ -132,7 +132,7 @@ def test_an_interrupt_while_workers_start_leaves_no_process(
 ) -> None:
     """The first workers run their sessions already when the interrupt comes."""
     out = tmp_path / "out"
-    sessions = sessions_of([str(good.manifest)], Common(), {"rate": "value"})
+    sessions = sessions_of([str(good.manifest)], Common())
     tasks = tasks_of(sessions, str(out), tmp_path, retries=0, pages=False)
     start_thread = threading.Thread.start
     count = itertools.count()
@@ -293,7 +293,7 @@ def test_a_plan_of_finished_sessions_is_their_time(good: Dataset, tmp_path: Path
     out = tmp_path / "out"
     assert run(good, out).code == 0
     records = [json.loads(path.read_text()) for path in out.glob("*/session.json")]
-    sessions = sessions_of([str(good.manifest)], Common(), {"rate": "value"})
+    sessions = sessions_of([str(good.manifest)], Common())
     tasks = tasks_of(sessions, str(out), tmp_path, retries=0, pages=True)
     plan = plan_of(tasks, 1)
     assert plan.measured == 4

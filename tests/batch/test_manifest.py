@@ -11,8 +11,6 @@ from mlbatch.batch.manifest import Common, chosen, parse_part, sessions_of
 from mlbatch.batch.session import OWN, Option, Session
 from mlbatch.errors import MlbatchError, RigError, UsageError
 
-KINDS = {"rate": "value", "split": "flag", "metadata": "list", "on-jump": "value", "jobs": "value"}
-KINDS |= {"no-fsync": "flag", "format": "value"}
 SENSOR = "sensors: [{name: a, stream: {port: 7502}}]\n"
 SWEEPS = "sensors: [{name: a, points: {glob: top/*.bin, dtype: {x: f4, y: f4, z: f4, t: u4}}}]\n"
 # Content of files; others are empty.
@@ -37,7 +35,7 @@ def read(folder: Path, text: str, given: Common | None = None) -> dict[str, Sess
     """The sessions of a manifest by name."""
     path = folder / "manifest.yaml"
     path.write_text(f"schema: mlbatch.batch/1\n{text}", encoding="utf-8")
-    found = sessions_of([str(path)], given or Common(), KINDS)
+    found = sessions_of([str(path)], given or Common())
     return {session.name: session for session in found}
 
 
@@ -148,7 +146,7 @@ def test_files_that_are_no_recordings_are_left_out_with_a_line(tmp_path: Path) -
     )
     lines: list[str] = []
     for source in (f"{tmp_path}/raw/*", f"{tmp_path}/manifest.yaml"):
-        found = sessions_of([source], Common("r.yaml"), KINDS, lines.append)
+        found = sessions_of([source], Common("r.yaml"), lines.append)
         assert [(one.name, one.rig) for one in found] == [("b", "r.yaml"), ("drive7", "r.yaml")]
     expected = "left out 2 files that are no recordings: empty.txt, left.json"
     assert lines[0] == f"{tmp_path}/raw/*: {expected}"
@@ -193,7 +191,7 @@ def test_mistakes_are_one_line(name: str, tmp_path: Path) -> None:
 def test_a_manifest_needs_its_schema(tmp_path: Path) -> None:
     (tmp_path / "manifest.yaml").write_text("sessions: []\n")
     with pytest.raises(MlbatchError, match="expected the key schema"):
-        sessions_of([str(tmp_path / "manifest.yaml")], Common(), KINDS)
+        sessions_of([str(tmp_path / "manifest.yaml")], Common())
 
 
 def sessions(names: str) -> list[Session]:
