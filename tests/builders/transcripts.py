@@ -2,7 +2,8 @@
 
 A block begins with `# NAME`. Its lines `$ COMMAND` are typed one after another in one folder; below
 each stand what it prints, {*} for any text, and `exit CODE` unless that is 0. Commands other than
-`mlbatch` are those of a shell. Text before the first block is a comment.
+`mlbatch` are those of a shell, as is one that its output is piped into. Text before the first block
+is a comment.
 """
 
 from __future__ import annotations
@@ -35,8 +36,15 @@ class Step:
             self._compare(done.stdout + done.stderr, done.returncode)
             return
         before = _files(folder)
-        outcome = shell(self.words.removeprefix("mlbatch "))
-        self._compare(outcome.out + outcome.err, outcome.code)
+        words, _, filtered_by = self.words.removeprefix("mlbatch ").partition(" | ")
+        outcome = shell(words)
+        printed = outcome.out
+        if filtered_by:
+            done = subprocess.run(
+                ["sh", "-c", filtered_by], input=printed, capture_output=True, text=True
+            )
+            printed = done.stdout
+        self._compare(printed + outcome.err, outcome.code)
         if outcome.code not in LEAVES_OUTPUT:
             assert _files(folder) == before
 

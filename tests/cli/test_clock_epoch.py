@@ -8,7 +8,6 @@ from pathlib import Path
 import pytest
 from mcap.reader import make_reader
 
-from mlbatch.simulate.ouster.encode import OusterSpec
 from tests.builders.bags import Body, Recorded
 from tests.builders.mcaps import write_mcap
 from tests.builders.sessions import (
@@ -16,18 +15,12 @@ from tests.builders.sessions import (
     NS_PER_MS,
     NS_PER_S,
     RECORDINGS,
-    SMALL,
     Shell,
     Unit,
-    report_of,
-    twin,
-    write_session,
 )
 from tests.builders.sessions_of_bags import unit_messages
 
 TAI_S = 37
-PTP_SPEC: OusterSpec = replace(SMALL, timestamp_mode="TIME_FROM_PTP_1588")
-ZERO = "extrinsics: {translation_m: [0, 0, 0]}"
 needs_recordings = pytest.mark.skipif(not RECORDINGS.is_dir(), reason=NO_RECORDINGS)
 
 
@@ -36,69 +29,6 @@ def _ahead(seconds: float, unit: Unit | None = None) -> Unit:
     unit = unit or Unit(turns=6)
     ahead_ns = round(seconds * NS_PER_S)
     return replace(unit, begin_ns=unit.begin_ns + ahead_ns, host_ns=unit.host_ns - ahead_ns)
-
-
-@pytest.mark.parametrize("jobs", ["1", "3"])
-def test_a_single_lidar_on_tai(shell: Shell, tmp_path: Path, jobs: str) -> None:
-    write_session(tmp_path, _ahead(TAI_S))
-    outcome = shell(f"convert drive.pcap -o out --jobs {jobs}")
-    assert (outcome.code, outcome.warnings) == (0, ["clock_epoch"])
-    (warning,) = report_of("out/report.json")["warnings"]
-    assert (warning["code"], warning["sensor"]) == ("clock_epoch", "ouster_111")
-    assert warning["message"] == (
-        "ouster_111: expected a clock within 1 s of the capture host's, found "
-        "+36.998805 s (37 s: TAI - UTC); use --clock host or --align-clocks, or `clock: "
-        "{epoch: tai}` in the rig"
-    )
-    # A packet is received 1 ms, and a column of 0.195 ms, after its newest stamp.
-    # Scan 0 begins at the first bound after 1800000037.02 s.
-    assert "first scan at 2027-01-15T08:00:37.100 TAI\n" in outcome.out
-
-
-@pytest.mark.parametrize("remedy", ["--clock host", "--align-clocks", "--rig rig.yaml"])
-def test_every_remedy_ends_the_warning(shell: Shell, tmp_path: Path, remedy: str) -> None:
-    write_session(tmp_path, _ahead(540.793))
-    outcome = shell("convert drive.pcap -o before")
-    assert outcome.warnings == ["clock_epoch"]
-    line = outcome.err.split("`")[1]
-    # Packets come 1 ms and a packet's length after their newest column.
-    assert line == "clock: {offset_s: -540.792}"
-    (tmp_path / "rig.yaml").write_text(
-        'sensors:\n- {name: left, stream: {serial: "111"}, metadata: 111.json, '
-        f"{ZERO}, {line}}}\n"
-    )
-    outcome = shell(f"convert drive.pcap -o out --strict {remedy}")
-    assert (outcome.code, outcome.warnings) == (0, []), outcome.err
-    assert "first scan at 2027-01-15T08:00:00." in outcome.out
-
-
-def test_lidars_that_agree_with_each_other_only(shell: Shell, tmp_path: Path) -> None:
-    write_session(tmp_path, _ahead(-5.25), twin(_ahead(-5.25), 222))
-    outcome = shell("convert drive.pcap -o out --identity-extrinsics")
-    assert (outcome.code, outcome.warnings) == (0, ["identity_extrinsics", "clock_epoch"])
-    (_, warning) = report_of("out/report.json")["warnings"]
-    assert warning["sensor"] == ""
-    assert warning["message"].startswith("ouster_111, ouster_222: expected a clock within 1 s")
-    assert "for every sensor `clock: {offset_s: 5.251}` in the rig" in warning["message"]
-
-
-@pytest.mark.parametrize(("spec", "codes"), [(SMALL, []), (PTP_SPEC, ["clock_epoch"])])
-def test_a_count_from_power_on_is_a_fault_of_a_time_source_only(
-    shell: Shell, tmp_path: Path, spec: OusterSpec, codes: list[str]
-) -> None:
-    unit = Unit(spec, begin_ns=866 * NS_PER_S, host_ns=1_799_999_134 * NS_PER_S)
-    write_session(tmp_path, unit)
-    outcome = shell("convert drive.pcap -o out")
-    assert (outcome.code, outcome.warnings) == (0, codes)
-    assert "first scan at 866.100 s since power-on\n" in outcome.out
-    if codes:
-        assert "the time source never locked; time source TIME_FROM_PTP_1588" in outcome.err
-
-
-def test_inspect_names_the_remedy(shell: Shell, tmp_path: Path) -> None:
-    write_session(tmp_path, _ahead(TAI_S))
-    outcome = shell("inspect drive.pcap")
-    assert "note: ouster_111: expected a clock within 1 s of the capture host's" in outcome.out
 
 
 @needs_recordings

@@ -121,18 +121,6 @@ def test_a_report_with_nan(shell: Shell, output: str) -> None:
         assert len(outcome.err.splitlines()) == 1
 
 
-def test_the_account_of_a_shard_nested_too_deeply(shell: Shell) -> None:
-    Path("part").mkdir()
-    Path("part/shard.json").write_text("[" * 100_000)
-    _one_line(
-        shell,
-        "merge part -o out",
-        1,
-        "part/shard.json: expected the account of a shard, found damaged content (brackets nested "
-        "too deeply); convert this shard again with --overwrite",
-    )
-
-
 # -- disks ------------------------------------------------------------------------------------
 
 WRITTEN = {
@@ -233,43 +221,6 @@ def test_reports_are_read_from_standard_input_up_to_a_limit(
 
 
 # -- names and words --------------------------------------------------------------------------
-
-UNSET = "expected a path, found an empty word; check that the variable of the shell is set"
-WORDS = {
-    "input": (f"convert '' -r {RIG} --dry-run", 2, f"RECORDINGS: {UNSET}"),
-    "output": (f"convert {PAIR} -o ''", 2, f"--output: {UNSET}"),
-    "rig": (f"inspect {CAPTURE} -r ''", 2, f"--rig: {UNSET}"),
-    "verified": ("verify ''", 2, f"OUTPUT: {UNSET}"),
-    "link to itself as output": (
-        f"convert {PAIR} -o loop --overwrite",
-        1,
-        "loop: expected a folder to overwrite, found none; choose another",
-    ),
-    "link to itself as input": (
-        "convert loop -o x.mcap",
-        1,
-        "loop: expected a recording, could not read it (Too many levels of symbolic links); check "
-        "the disk",
-    ),
-    "page on a device": (
-        f"convert {PAIR} --dry-run --html /dev/null",
-        1,
-        "/dev/null: expected a new file or an earlier page, found a device; choose another name "
-        "for the page",
-    ),
-}
-
-
-@pytest.mark.parametrize("name", WORDS)
-def test_words_that_name_nothing(shell: Shell, name: str) -> None:
-    Path("loop").symlink_to("loop")
-    command, code, message = WORDS[name]
-    _one_line(shell, command, code, message)
-
-
-def test_a_format_for_a_dry_run_needs_no_output(shell: Shell) -> None:
-    outcome = shell(f"convert {PAIR} --dry-run -f npz -q --report report.json")
-    assert (outcome.code, outcome.err) == (0, "")
 
 
 def test_names_that_are_no_text(shell: Shell) -> None:

@@ -82,6 +82,7 @@ def _write_sessions(folder: Path) -> None:
     write_session(folder / "bare", one, metadata=False)
     _write_other_modes(folder)
     write_timed_sessions(folder)
+    write_metadata_sessions(folder)
     write_session(folder / "uptime", UPTIME)
     write_session(folder / "pair", one, twin(one, 222))
     (folder / "other").mkdir()
@@ -132,8 +133,46 @@ def write_timed_sessions(folder: Path) -> None:
         after = replace(before, begin_ns=begin_ns, host_ns=host_ns, first_frame=11)
         write_session(folder / name, before, after)
     six = Unit(turns=6)
-    ahead = replace(six, begin_ns=six.begin_ns + 37 * NS_PER_S, host_ns=six.host_ns - 37 * NS_PER_S)
-    write_session(folder / "tai", ahead)
+    write_session(folder / "tai", _ahead(six, 37_000))
+    # 540.793 s ahead of the capture host, and two lidars 5.25 s behind it.
+    write_session(folder / "ahead", _ahead(six, 540_793))
+    both = _ahead(six, -5_250)
+    write_session(folder / "behind", both, twin(both, 222))
+    ptp = replace(SMALL, timestamp_mode="TIME_FROM_PTP_1588")
+    for name, spec in (("counted", SMALL), ("ptp", ptp)):
+        write_session(folder / name, _ahead(Unit(spec), -(EPOCH_NS // NS_PER_MS - 866_000)))
+
+
+def _ahead(unit: Unit, ms: int) -> Unit:
+    """The lidar with a clock ahead of the capture host's."""
+    step_ns = ms * NS_PER_MS
+    return replace(unit, begin_ns=unit.begin_ns + step_ns, host_ns=unit.host_ns - step_ns)
+
+
+def write_metadata_sessions(folder: Path) -> None:
+    """Metadata that are not of the packets, or say little."""
+    six = Unit(turns=6)
+    fast = replace(SMALL, columns_per_frame=1024)
+    files = {
+        "two_modes": {"a": fast, "b": SMALL},
+        "faster": {"111": replace(SMALL, rate_hz=20)},
+        "restarted": {"111": replace(SMALL, init_id=SMALL.init_id + 1)},
+    }
+    for name, specs in files.items():
+        write_session(folder / name, six, metadata=False)
+        for stem, spec in specs.items():
+            write_metadata(folder / name / f"{stem}.json", spec)
+    # All revolutions have the numbers of the first one.
+    still = [replace(six, turns=1, begin_ns=six.begin_ns + n * NS_PER_S // 10) for n in range(6)]
+    write_session(folder / "still", *still)
+    write_session(folder / "captured_twice", six, more=six.records)
+    write_session(folder / "legacy_unit", replace(six, spec=replace(SMALL, profile="LEGACY")))
+    pose = [1.0, 0.0, 0.0, 1.5, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 2.0, 0.0, 0.0, 0.0, 1.0]
+    write_session(folder / "posed", replace(six, spec=replace(SMALL, extrinsic_m=pose)))
+    for name, mode in (("unnamed", ""), ("internal", "TIME_FROM_INTERNAL_OSC")):
+        spec = replace(SMALL, timestamp_mode=mode)
+        since = _ahead(replace(six, spec=spec), -(EPOCH_NS // NS_PER_MS - 866_000))
+        write_session(folder / name, since)
 
 
 def _write_other_modes(folder: Path) -> None:
