@@ -153,7 +153,7 @@ SCORES = [
 def test_files_that_packets_fit(file: str, unit: Unit, score: int) -> None:
     """For want of a device packet, points of a ROBOSENSE tell their returns themselves."""
     calibration = file_of(file)
-    stream = stream_of(unit.spec, unit.packets) if not unit.points else unit.stream
+    stream = unit.stream
     evidence = evidence_of(stream.packets, stream.host_ns)
     assert calibration.match_score(evidence) == score
     if score == 200 and isinstance(unit.spec, RobosenseSpec):
@@ -162,6 +162,15 @@ def test_files_that_packets_fit(file: str, unit: Unit, score: int) -> None:
             lidar.mode.split(",")[0] == f"{'dual' if unit.spec.returns == 2 else 'single'} return"
         )
         assert set(lidar.return_types) == {0}
+        rise = np.sin(np.radians(robosense.fan(unit.spec).elevation_deg))
+        np.testing.assert_allclose(lidar.beams.direction[2, :, 2], rise, atol=1e-6)
+
+
+def test_a_rig_cannot_name_what_packets_contradict() -> None:
+    """The Puck Hi-Res has its own product byte, a Ruby Plus of rs_driver its own type."""
+    plus = Unit(RobosenseSpec("Ruby Plus 80"), {30: bytes.fromhex("050200")})
+    for model, unit in (("Puck Hi-Res", Unit(VelodyneSpec("VLP-16"))), ("Ruby 80", plus)):
+        assert named(model).match_score(unit.stream.evidence) == NAMED_ONLY
 
 
 # -- models and notes -----------------------------------------------------------------------------

@@ -14,9 +14,11 @@ from mlbatch.arrays import F32Array, F64Array, U8Array
 from mlbatch.frames.transforms import from_quaternion
 from mlbatch.lidar.interface import FAULTS, Calibration, Evidence, Lidar
 from mlbatch.ros.point_packets import Layout, Points, layout_of, pack
-from mlbatch.sensors.pointcloud.sensor import BUILT_IN, MODELS
+from mlbatch.sensors.pointcloud.sensor import BUILT_IN, MODELS, CloudLidar
 from mlbatch.types import Stream
 from tests.builders.decoded import readings
+from tests.builders.engines import needs_native
+from tests.builders.headers import check_headers
 from tests.builders.points import STAMP_NS, VELODYNE, cloud_message, write_points
 from tests.builders.rosbag2 import write_rosbag2
 
@@ -173,6 +175,40 @@ def test_columns_by_ring_are_named_so() -> None:
     layout = layout_of(points, 0)
     lidar = CLOUD.lidar({}, _evidence(pack(points, layout, 0)))
     assert lidar.mode == "up to 16 points a column by ring"
+
+
+HOST_NS = np.full(40, STAMP_NS)
+
+
+def _by_ring() -> tuple[Lidar, U8Array]:
+    """Forty columns of eight rings."""
+    nothing = np.zeros(320, np.uint8)
+    stamp_ns = STAMP_NS + np.repeat(np.arange(40), 8) * 55_296
+    reals = np.random.default_rng(3).random((4, 320)).astype(np.float32)
+    ring = np.tile(np.arange(8, dtype=np.uint16), 40)
+    layout = Layout(0, 16, by_ring=True)
+    packets = pack(Points(stamp_ns, reals, ring, nothing, nothing), layout, 0)
+    return CloudLidar(layout, "/top"), packets
+
+
+@needs_native
+def test_headers_say_what_packets_literally_say() -> None:
+    """Each packet is a column; of another layout it is damage; times may fall."""
+    lidar, packets = _by_ring()
+    stamp_ns = check_headers(lidar, packets, HOST_NS).columns.stamp_ns[:, 0]
+    assert stamp_ns.tolist() == (STAMP_NS + np.arange(40) * 55_296).tolist()
+    assert not check_headers(lidar, packets[::-1], HOST_NS).faults.any()
+    packets[7, 5] = 1
+    assert check_headers(lidar, packets, HOST_NS).faults.any()
+
+
+@needs_native
+def test_hashes_that_are_known_are_used() -> None:
+    lidar, packets = _by_ring()
+    keys = np.arange(40)
+    assert lidar.reader is not None
+    found = lidar.reader.read(packets.reshape(-1), keys * lidar.packet_size, HOST_NS, keys)
+    assert found.key.tolist() == keys.tolist()
 
 
 def test_points_with_times_of_their_own_keep_their_rings(tmp_path: Path) -> None:
