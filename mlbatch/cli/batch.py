@@ -178,7 +178,9 @@ def _progress(count: int, *, quiet: bool) -> Iterator[Progress]:
     from mlbatch.cli.summary import say
 
     with progress_bar("sessions", unit="sessions", is_shown=not quiet) as bar:
-        done = itertools.count(1)
+        done = itertools.count()
+        if bar is not None:
+            bar(next(done), count)
 
         def ended(one: SessionStatus) -> None:
             if one.is_failed and not one.is_earlier:

@@ -23,7 +23,7 @@ class Reporter:
         show: Callable[[Reporter], None],
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        """unit: MB or scans, of what is counted; clock: s, never steps back."""
+        """unit: MB, or what is counted; clock: s, never steps back."""
         self._stages = stages
         self._number = 0
         self._unit = unit
@@ -60,8 +60,8 @@ class Reporter:
 
     def amount(self) -> str:
         """What is done, of all."""
-        if self._unit == "scans":
-            return f"{self.done}/{self.total or '?'} scans"
+        if self._unit != "MB":
+            return f"{self.done}/{self.total or '?'} {self._unit}"
         text = f"{self.done / _BYTES_PER_MB:.1f}/{self.total / _BYTES_PER_MB:.1f} MB"
         return f"{text}, {self.scans} scans" if self.scans else text
 

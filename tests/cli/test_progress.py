@@ -133,13 +133,18 @@ def _on_a_terminal(folder: Path, command: str) -> tuple[int, bytes]:
     return process.returncode, said
 
 
-@pytest.mark.parametrize("command", [*COMMANDS, "verify done.mcap"])
+BATCH = f"batch {CAPTURE} --rig {RIG} -o out"
+# Where a command counts something other than bytes.
+AMOUNTS = {"verify done.mcap": b"7/7 scans", BATCH: b"1/1 sessions"}
+
+
+@pytest.mark.parametrize("command", [*COMMANDS, *AMOUNTS])
 def test_a_terminal_shows_a_bar(shell: Shell, tmp_path: Path, command: str) -> None:
     assert shell(f"convert {CAPTURE} --rig {RIG} -o done.mcap").code == 0
     code, said = _on_a_terminal(tmp_path, command)
     assert code == 0
-    assert command.split()[0].encode() in said
-    assert (b"7/7 scans" if command.startswith("verify") else b"2.5/2.5 MB") in said
+    assert (b"sessions" if command == BATCH else command.split()[0].encode()) in said
+    assert AMOUNTS.get(command, b"2.5/2.5 MB") in said
     assert b"ETA" in said
     # The bar disappears: its line is erased at the end.
     assert said.rstrip().endswith(b"\x1b[2K")
