@@ -9,9 +9,8 @@ from __future__ import annotations
 from os import PathLike
 from pathlib import Path
 
-from mlbatch.digests.comparison import Comparison, Difference, compare
+from mlbatch.digests.comparison import Comparison, Difference, Json, compare
 from mlbatch.digests.golden import SCHEMA, golden_of, golden_text, read_golden
-from mlbatch.digests.values import Json
 
 __all__ = [
     "SCHEMA",

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from typing import TypeAlias
 
-from mlbatch.digests.values import Json
+Json: TypeAlias = "dict[str, Json] | list[Json] | str | int | float | bool | None"
+
 
 # Extrinsics are float64 of the rig: the same to all but the last digits.
 _POSE = "body_from_sensor"

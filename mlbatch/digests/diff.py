@@ -10,10 +10,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from mlbatch.digests.comparison import Difference, scan_name, walk
-from mlbatch.digests.fields import Values, fields_of
-from mlbatch.digests.run import describe_run
-from mlbatch.digests.values import Json, values
+from mlbatch.digests.comparison import Difference, Json, scan_name, walk
+from mlbatch.digests.golden import Values, describe_run, fields_of, values
 from mlbatch.errors import UsageError
 from mlbatch.outputs.read import read
 from mlbatch.outputs.run_files import RunFiles

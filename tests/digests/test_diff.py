@@ -4,42 +4,31 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import pytest
 
 from mlbatch.digests.diff import diff
 from tests.builders.run import command
 from tests.digests.test_digest import FORMATS, MOVED, convert, other_rig
+from tests.verification.edits import edit_of
 
-Array = npt.NDArray[Any]
+# All points but that of number 100.
+WITHOUT_100 = '"v[[*range(100),*range(101,len(v))]]"'
 POINTS = (
     *("xyz", "intensity", "reflectivity", "range_m", "time_ns", "ring", "return_type"),
     *("lidar_id", "column"),
 )
 
 
-def change(path: Path, **values: Callable[[Array], Array]) -> None:
-    """Replace arrays of an npz file: each function gets the old array and returns the new one."""
-    with np.load(path) as found:
-        arrays = dict(found)
-    for name, edit in values.items():
-        arrays[name] = edit(arrays[name].copy())
-    np.savez(path, **arrays)
-
-
-def at(place: Any, amount: Any) -> Callable[[Array], Array]:
-    """An edit that adds to one value."""
-
-    def edit(array: Array) -> Array:
-        array[place] += amount
-        return array
-
-    return edit
+def changed(folder: Path, edit: str) -> tuple[Path, Path]:
+    """An output, and a copy with an edit (tests/verification/edits.py)."""
+    a = convert(folder / "a", "npz")
+    b = folder / "b"
+    shutil.copytree(a, b)
+    edit_of(edit)(b)
+    return a, b
 
 
 @pytest.mark.parametrize("kind", FORMATS)
@@ -71,11 +60,11 @@ def test_scans_of_sensors_meet_in_folders_and_files(tmp_path: Path) -> None:
 
 
 def test_the_first_difference_and_the_largest(tmp_path: Path) -> None:
-    a = convert(tmp_path / "a", "npz")
-    b = tmp_path / "b"
-    shutil.copytree(a, b)
-    change(b / "000002.npz", xyz=at((5, 1), 0.5), ring=at(7, 3))
-    change(b / "000004.npz", xyz=at((slice(2, 4), 2), 2.0))
+    edits = (
+        "add 000002.npz xyz (5,1) 0.5; add 000002.npz ring 7 3",
+        "add 000004.npz xyz (2,2) 2.0; add 000004.npz xyz (3,2) 2.0",
+    )
+    a, b = changed(tmp_path, "; ".join(edits))
     found = diff(a, b)
     assert (found.run, found.only_in_a, found.only_in_b, found.compared) == ([], [], [], 7)
     first = found.first
@@ -95,11 +84,8 @@ def test_the_first_difference_and_the_largest(tmp_path: Path) -> None:
 @pytest.mark.parametrize(("tolerance", "is_found"), [(0.4, True), (0.6, False)])
 def test_a_tolerance_holds_for_each_point(tolerance: float, is_found: bool, tmp_path: Path) -> None:
     """A point moved by 0.5 m, and a pair whose sum is 0."""
-    a = convert(tmp_path / "a", "npz")
-    b = tmp_path / "b"
-    shutil.copytree(a, b)
-    change(b / "000002.npz", xyz=at((5000, 2), 0.5))
-    change(b / "000004.npz", xyz=at((slice(6000, 6002), 2), np.array([0.5, -0.5], np.float32)))
+    pair = "add 000004.npz xyz (6000,2) 0.5; add 000004.npz xyz (6001,2) -0.5"
+    a, b = changed(tmp_path, f"add 000002.npz xyz (5000,2) 0.5; {pair}")
     words = ("diff", a, b, "--tolerance", str(tolerance))
     assert command(*words).code == int(is_found)
     found = diff(a, b, tolerance)
@@ -116,10 +102,7 @@ def test_a_tolerance_is_a_number_from_0(tolerance: str, tmp_path: Path) -> None:
 
 
 def test_stamps_are_compared_to_the_nanosecond(tmp_path: Path) -> None:
-    a = convert(tmp_path / "a", "npz")
-    b = tmp_path / "b"
-    shutil.copytree(a, b)
-    change(b / "000000.npz", column_stamp_ns=at(9, 1))
+    a, b = changed(tmp_path, "add 000000.npz column_stamp_ns 9 1")
     found = diff(a, b)
     assert [(one.field, one.point, one.by) for one in found.fields.values()] == [
         ("column_stamp_ns", 9, 1.0)
@@ -127,10 +110,7 @@ def test_stamps_are_compared_to_the_nanosecond(tmp_path: Path) -> None:
 
 
 def test_a_missing_point_is_the_first_difference(tmp_path: Path) -> None:
-    a = convert(tmp_path / "a", "npz")
-    b = tmp_path / "b"
-    shutil.copytree(a, b)
-    change(b / "000003.npz", **{name: lambda array: np.delete(array, 100, 0) for name in POINTS})
+    a, b = changed(tmp_path, "; ".join(f"be 000003.npz {n} {WITHOUT_100}" for n in POINTS))
     found = diff(a, b).fields
     assert set(found) == {*POINTS}
     first = found["intensity"]

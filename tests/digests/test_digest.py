@@ -13,7 +13,7 @@ import pytest
 
 import mlbatch
 from mlbatch.digests import compare, golden_text, read_golden
-from mlbatch.digests.fields import describe
+from mlbatch.digests.golden import describe
 from mlbatch.errors import MlbatchError
 from tests.builders.run import TWO_LIDARS, command
 from tests.golden.digest_recordings import rig_of, write_recordings
@@ -33,6 +33,7 @@ FORMATS = {
 # The first sensor is moved by 0.1 mm; its clock is 1 us ahead.
 MOVED = ("translation_m: [0.3, 0.95, 2.45]", "translation_m: [0.3, 0.9501, 2.45]")
 LATER = ("    metadata: left.json", "    metadata: left.json\n    clock: {offset_s: 0.000001}")
+LOST = ("--fault", "drop:left:1%")
 Golden = dict[str, Any]
 
 
@@ -165,35 +166,26 @@ def test_an_mcap_file_alone_has_its_report_inside(tmp_path: Path) -> None:
 # -- found ------------------------------------------------------------------------------------
 
 
+# Another rig, options, a difference of the run, and one of the scans without their report.
+FOUND: dict[str, tuple[tuple[str, str], tuple[str, ...], str, str]] = {
+    "a tenth of a millimetre": (MOVED, (), "run.sensors[0].body_from_sensor[1][3]", " xyz "),
+    "one percent of loss": (("", ""), LOST, "run.sensors[0].packets.lost", " points"),
+    "a microsecond of clock": (LATER, (), "", " time_ns "),
+}
+
+
 @pytest.mark.parametrize("kind", FORMATS)
-def test_a_tenth_of_a_millimetre_is_found(kind: str, tmp_path: Path) -> None:
-    rig = other_rig(tmp_path, MOVED)
+@pytest.mark.parametrize("name", FOUND)
+def test_a_small_change_is_found(name: str, kind: str, tmp_path: Path) -> None:
+    change, options, of_run, of_scans = FOUND[name]
+    rig = other_rig(tmp_path, change)
     golden = mlbatch.digest(convert(tmp_path / "a", kind))
-    moved = mlbatch.digest(convert(tmp_path / "b", kind, rig=rig))
-    places = [one.where for one in compare(golden, moved).differences]
-    assert "run.sensors[0].body_from_sensor[1][3]" in places
+    other = mlbatch.digest(convert(tmp_path / "b", kind, *options, rig=rig))
+    if of_run:
+        assert of_run in [one.where for one in compare(golden, other).differences]
     # Also where there is no report.
-    bare = without_report(golden), without_report(moved)
-    assert any(" xyz " in one.where for one in compare(*bare).differences)
-
-
-@pytest.mark.parametrize("kind", FORMATS)
-def test_one_percent_of_loss_is_found(kind: str, tmp_path: Path) -> None:
-    golden = mlbatch.digest(convert(tmp_path / "a", kind))
-    lost = mlbatch.digest(convert(tmp_path / "b", kind, "--fault", "drop:left:1%"))
-    places = [one.where for one in compare(golden, lost).differences]
-    assert "run.sensors[0].packets.lost" in places
-    bare = without_report(golden), without_report(lost)
-    assert any(one.where.endswith(" points") for one in compare(*bare).differences)
-
-
-@pytest.mark.parametrize("kind", FORMATS)
-def test_a_microsecond_of_clock_is_found(kind: str, tmp_path: Path) -> None:
-    rig = other_rig(tmp_path, LATER)
-    golden = mlbatch.digest(convert(tmp_path / "a", kind))
-    later = mlbatch.digest(convert(tmp_path / "b", kind, rig=rig))
-    bare = without_report(golden), without_report(later)
-    assert any(" time_ns " in one.where for one in compare(*bare).differences)
+    bare = compare(without_report(golden), without_report(other)).differences
+    assert any(of_scans in one.where for one in bare)
 
 
 # Changes of a document: path, and what is added.
