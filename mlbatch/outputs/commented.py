@@ -18,6 +18,23 @@ from mlbatch.outputs.stored_scan import StoredScan, seconds_to_ns
 Values: TypeAlias = npt.NDArray[np.generic]
 
 
+def commented_limits(name: str) -> dict[str, str]:
+    """What files of a format with comments and points cannot show."""
+    absent = {
+        "geometry": "ranges",
+        "duplicates": "columns",
+        "tf_static": "transforms",
+        "imu": "IMU samples",
+        "messages": "messages",
+        "stamps": "log times",
+    }
+    return {
+        "columns": f"first and last column of a scan, by scans.csv; {name} has no column stamps",
+        "order": f"points step back by less than a column's duration; {name} has no columns",
+        **{check: f"{name} has no {what}" for check, what in absent.items()},
+    }
+
+
 @dataclass(slots=True)
 class StoredPoints:
     """Point arrays as stored: (p,), or (n, slots) in an organized scan; None: not stored."""

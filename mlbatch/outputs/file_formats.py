@@ -11,6 +11,7 @@ from pathlib import Path
 
 from mlbatch.outputs import float_rows as rows
 from mlbatch.outputs import las, npz, pcd, ply
+from mlbatch.outputs.commented import commented_limits
 from mlbatch.outputs.damage import CheckLog
 from mlbatch.outputs.folders import ScanReader
 
@@ -30,10 +31,10 @@ class FileFormat:
 # In the order in which suffixes are looked for: that of kitti is the end of that of nuscenes.
 FILE_FORMATS = (
     FileFormat("npz", npz.SUFFIX, npz.NpzReader, npz.LIMITS | {"geometry": _RANGES}),
-    FileFormat("ply", ply.SUFFIX, ply.PlyReader, ply.LIMITS),
-    FileFormat("pcd", pcd.SUFFIX, pcd.PcdReader, pcd.LIMITS),
-    FileFormat("las", las.LAS_SUFFIX, las.LasReader, las.LIMITS),
-    FileFormat("laz", las.LAZ_SUFFIX, las.LasReader, las.LIMITS),
+    FileFormat("ply", ply.SUFFIX, ply.PlyReader, commented_limits("PLY")),
+    FileFormat("pcd", pcd.SUFFIX, pcd.PcdReader, commented_limits("PCD")),
+    FileFormat("las", las.LAS_SUFFIX, las.LasReader, commented_limits("LAS")),
+    FileFormat("laz", las.LAZ_SUFFIX, las.LasReader, commented_limits("LAS")),
     FileFormat("nuscenes", rows.NUSCENES_SUFFIX, rows.RowReader, rows.NUSCENES_LIMITS),
     FileFormat("kitti", rows.KITTI_SUFFIX, rows.RowReader, rows.KITTI_LIMITS),
 )

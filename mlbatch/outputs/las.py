@@ -55,17 +55,6 @@ _UTC_S_SINCE = 1_483_228_800
 # A float64 of seconds resolves 0.24 us since 1970.
 _TIME_ERROR_S = 5e-7
 
-LIMITS = {
-    "columns": "first and last column of a scan, by scans.csv; LAS has no column stamps",
-    "order": "points step back by less than a column's duration; LAS has no columns",
-    "geometry": "LAS has no ranges",
-    "duplicates": "LAS has no columns",
-    "tf_static": "LAS has no transforms",
-    "imu": "LAS has no IMU samples",
-    "messages": "LAS has no messages",
-    "stamps": "LAS has no log times",
-}
-
 
 @dataclass(frozen=True, slots=True)
 class LasFile:

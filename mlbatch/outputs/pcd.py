@@ -40,17 +40,6 @@ _HEAD = b"# .PCD v0.7"
 _END = b"\nDATA binary\n"
 _LONGEST_HEAD = 1 << 20
 
-LIMITS = {
-    "columns": "first and last column of a scan, by scans.csv; PCD has no column stamps",
-    "order": "points step back by less than a column's duration; PCD has no columns",
-    "geometry": "PCD has no ranges",
-    "duplicates": "PCD has no columns",
-    "tf_static": "PCD has no transforms",
-    "imu": "PCD has no IMU samples",
-    "messages": "PCD has no messages",
-    "stamps": "PCD has no log times",
-}
-
 
 class PcdReader(CommentedReader):
     """Reads the files of one folder."""

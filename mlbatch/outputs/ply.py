@@ -30,17 +30,6 @@ _END = b"end_header\n"
 _LONGEST_HEAD = 1 << 20
 _VERTICES = re.compile(r"element vertex (\d{1,19})", re.ASCII)
 
-LIMITS = {
-    "columns": "first and last column of a scan, by scans.csv; PLY has no column stamps",
-    "order": "points step back by less than a column's duration; PLY has no columns",
-    "geometry": "PLY has no ranges",
-    "duplicates": "PLY has no columns",
-    "tf_static": "PLY has no transforms",
-    "imu": "PLY has no IMU samples",
-    "messages": "PLY has no messages",
-    "stamps": "PLY has no log times",
-}
-
 
 @dataclass(frozen=True, slots=True)
 class _Style:

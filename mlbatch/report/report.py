@@ -18,6 +18,7 @@ from mlbatch.report.ledger import (
     COLUMN_REASONS,
     IMU_REASONS,
     PACKET_REASONS,
+    DecodedCounts,
     SensorLedger,
     check_capture,
     check_datagrams,
@@ -366,35 +367,20 @@ def _timing(timing: Timing) -> Section:
 
 
 def _sensor(sensor: SensorReport) -> Section:
-    packets = sensor.ledger.packets
-    columns = sensor.ledger.columns
+    ledger = sensor.ledger
+    rejected = ordered(ledger.packets.rejected, PACKET_REASONS)
     return {
         "name": sensor.name,
         "model": sensor.model,
         "lidar_id": sensor.lidar_id,
         "stream": sensor.stream,
         "mode": sensor.mode,
-        "packets": {
-            "read": packets.read,
-            "accepted": packets.accepted,
-            "rejected": ordered(packets.rejected, PACKET_REASONS),
-            "lost": packets.lost,
-            "reordered": packets.reordered,
-        },
-        "imu_packets": sensor.ledger.imu_packets,
-        "imu_samples": {
-            "decoded": sensor.ledger.imu_samples.decoded,
-            "written": sensor.ledger.imu_samples.written,
-            "dropped": ordered(sensor.ledger.imu_samples.dropped, IMU_REASONS),
-        },
-        "columns": {
-            "decoded": columns.decoded,
-            "written": columns.written,
-            **({"reused": columns.reused} if columns.reused else {}),
-            "dropped": ordered(columns.dropped, COLUMN_REASONS),
-        },
+        "packets": asdict(ledger.packets) | {"rejected": rejected},
+        "imu_packets": ledger.imu_packets,
+        "imu_samples": _decoded(ledger.imu_samples, IMU_REASONS),
+        "columns": _decoded(ledger.columns, COLUMN_REASONS),
         "fill": sensor.fill,
-        "points": asdict(sensor.ledger.points),
+        "points": asdict(ledger.points),
         "clock": sensor.clock._asdict(),
         "extrinsics": {
             "source": sensor.extrinsics_source,
@@ -403,6 +389,12 @@ def _sensor(sensor: SensorReport) -> Section:
         "calibration": sensor.calibration,
         **({"calibration_note": sensor.calibration_note} if sensor.calibration_note else {}),
     }
+
+
+def _decoded(counts: DecodedCounts, reasons: tuple[str, ...]) -> Section:
+    """Columns or IMU samples; without `reused` where nothing is."""
+    found = asdict(counts) | {"dropped": ordered(counts.dropped, reasons)}
+    return {key: value for key, value in found.items() if value or key != "reused"}
 
 
 def _summary_row(sensor: SensorReport) -> tuple[str, ...]:

@@ -239,31 +239,17 @@ def _content(scan: StoredScan, column: int, by_column: I64Array | None) -> bytes
 
 def valid_points(log: CheckLog, scan: StoredScan) -> Points:
     """The points of a scan, checked to be finite; those of an organized one without empty slots."""
+    fields = ("time_ns", "ring", "return_type", "lidar_id")
+    planes = {name: getattr(scan, name) for name in fields}
     if not scan.organized:
         bad: BoolArray = np.logical_not(np.all(np.isfinite(scan.xyz), axis=1))
         log.none("finite", scan.point, bad, "finite coordinates", lambda at: scan.xyz[at])
-        return Points(
-            count=len(scan.xyz),
-            valid=None,
-            row=None,
-            xyz=scan.xyz,
-            time_ns=scan.time_ns,
-            ring=scan.ring,
-            return_type=scan.return_type,
-            lidar_id=scan.lidar_id,
-        )
+        return Points(len(scan.xyz), None, None, scan.xyz, **planes)
     valid: BoolArray = np.logical_not(np.all(np.isnan(scan.xyz), axis=2))
     _check_slots(log, scan, valid)
-    return Points(
-        count=int(np.count_nonzero(valid)),
-        valid=valid,
-        row=np.repeat(np.arange(len(valid)), np.count_nonzero(valid, axis=1)),
-        xyz=scan.xyz[valid],
-        time_ns=None if scan.time_ns is None else scan.time_ns[valid],
-        ring=None if scan.ring is None else scan.ring[valid],
-        return_type=None if scan.return_type is None else scan.return_type[valid],
-        lidar_id=None if scan.lidar_id is None else scan.lidar_id[valid],
-    )
+    row: I64Array = np.repeat(np.arange(len(valid)), np.count_nonzero(valid, axis=1))
+    picked = {name: None if plane is None else plane[valid] for name, plane in planes.items()}
+    return Points(len(row), valid, row, scan.xyz[valid], **picked)
 
 
 def _check_slots(log: CheckLog, scan: StoredScan, valid: BoolArray) -> None:
