@@ -1,4 +1,4 @@
-"""Which format an output gets, what is refused, and where the side files are."""
+"""Which format an output gets, what is refused, where the side files are, and how many jobs."""
 
 from __future__ import annotations
 
@@ -19,8 +19,11 @@ from mlbatch.writers import (
     choose_format,
     extras,
     format_names,
+    plugin,
     report_paths,
+    threads,
 )
+from mlbatch.writers.threads import jobs_for, parse_jobs
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -146,3 +149,46 @@ def test_a_missing_package_is_one_line(tmp_path: Path, monkeypatch: pytest.Monke
     assert str(caught.value).startswith("--format laz: expected the package lazrs, found none")
     assert str(caught.value).endswith("; pip install 'mlbatch-lidar[las]'")
     assert not list(tmp_path.iterdir())
+
+
+# -- number of jobs: as asked, or by cores and output ---------------------------------------------
+
+FAST = WriterOptions("standard", False, False)
+SLOW = WriterOptions("standard", False, False, compression="zstd")
+
+
+@pytest.mark.parametrize(("text", "jobs"), [("1", 1), ("64", 64), ("007", 7), ("auto", None)])
+def test_jobs_as_written(text: str, jobs: int | None) -> None:
+    assert parse_jobs("--jobs", text) == jobs
+
+
+@pytest.mark.parametrize("text", ["0", "65", "-1", "1.0", "", "Auto", "\u0663", "9" * 5000])
+def test_other_texts_are_refused(text: str) -> None:
+    with pytest.raises(UsageError, match="--jobs: expected 1 to 64, or auto, found"):
+        parse_jobs("--jobs", text)
+
+
+@pytest.mark.parametrize(
+    ("name", "options", "cores", "jobs"),
+    [
+        ("mcap", FAST, 8, 1),
+        ("npz", FAST, 8, 1),
+        ("mcap", SLOW, 1, 1),
+        ("mcap", SLOW, 3, 3),
+        ("rosbag2", SLOW, 8, 4),
+        ("laz", FAST, 2, 1),
+        ("las", FAST, 64, 1),
+    ],
+)
+def test_several_jobs_where_writing_is_slow(
+    name: str, options: WriterOptions, cores: int, jobs: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(threads, "_cores", lambda: cores)
+    assert jobs_for(None, name, options) == jobs
+    assert jobs_for(5, name, options) == 5
+
+
+def test_a_format_may_be_slow(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(threads, "_cores", lambda: 64)
+    monkeypatch.setattr(plugin("npz"), "IS_SLOW", True, raising=False)
+    assert jobs_for(None, "npz", FAST) == 4
