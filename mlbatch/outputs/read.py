@@ -19,9 +19,8 @@ from mlbatch.outputs.cloud_messages import CLOUD, read_cloud, stored_scan
 from mlbatch.outputs.containers import Message
 from mlbatch.outputs.damage import CheckLog, DamageError
 from mlbatch.outputs.encoding import MessageCursor
-from mlbatch.outputs.file_formats import FileFormat, format_of
 from mlbatch.outputs.folders import ScanFile, scan_files
-from mlbatch.outputs.kinds import kind_of
+from mlbatch.outputs.kinds import FileFormat, format_of, kind_of
 from mlbatch.outputs.metadata import RunMetadata, metadata_of_grid
 from mlbatch.outputs.run_files import PIECES, RunFiles, inner_texts
 from mlbatch.outputs.scan import Scan

@@ -13,9 +13,8 @@ from mlbatch.outputs.cloud_messages import CLOUD, read_cloud, stored_scan
 from mlbatch.outputs.containers import BoundedFile, Message, library_errors
 from mlbatch.outputs.damage import CheckLog, DamageError, VerifyError
 from mlbatch.outputs.encoding import MessageCursor
-from mlbatch.outputs.file_formats import FileFormat
 from mlbatch.outputs.folders import scan_files
-from mlbatch.outputs.kinds import kind_of
+from mlbatch.outputs.kinds import FileFormat, kind_of
 from mlbatch.outputs.run_files import mcaps_of
 from mlbatch.outputs.stored_scan import StoredScan
 from mlbatch.page.windows import Windows

@@ -52,7 +52,7 @@ def _reader(kind: Any, tolerant: bool) -> Read:
         inside = _reader(inner, tolerant)
         return lambda found: None if found is None else inside(found)
     if origin is np.ndarray:
-        return lambda found: np.array(found, np.float64)
+        return lambda found: np.array(_of(list, found), np.float64)
     if origin is tuple and arguments[-1] is not Ellipsis:
         readers = [_reader(one, tolerant) for one in arguments]
         return lambda found: tuple(

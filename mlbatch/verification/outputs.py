@@ -12,9 +12,8 @@ from typing import TYPE_CHECKING
 
 from mlbatch.outputs import npz
 from mlbatch.outputs.damage import CheckLog, DamageError, VerifyError
-from mlbatch.outputs.file_formats import FileFormat
 from mlbatch.outputs.folders import scan_files
-from mlbatch.outputs.kinds import kind_of
+from mlbatch.outputs.kinds import FileFormat, kind_of
 from mlbatch.outputs.metadata import RunMetadata, metadata_of_grid
 from mlbatch.outputs.run_files import PIECES, TABLE, RunFiles
 from mlbatch.verification import messages

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from mlbatch.cli.verify import SHOWN
-from mlbatch.outputs.file_formats import FILE_FORMATS
+from mlbatch.outputs.kinds import FILE_FORMATS
 from mlbatch.verification import CHECKS
 from tests.builders.run import ROOT, command
 from tests.builders.verify_outputs import Arrays, arrays, copied, made

@@ -11,6 +11,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from mlbatch.errors import RecordingError
 from mlbatch.report.ledger import SensorLedger, check_capture
 from mlbatch.report.report import (
     ClockReport,
@@ -22,6 +23,7 @@ from mlbatch.report.report import (
     Unassigned,
     Warned,
     imbalances,
+    report_of,
     report_text,
     summary_lines,
 )
@@ -304,3 +306,38 @@ def test_summary_names_sensors_scans_and_warnings() -> None:
     assert lines[2] == "2 scans at 10 Hz (1 incomplete, 3 empty windows), 2000 points, clock utc"
     assert "5.0 x real time" in lines[3]
     assert lines[4] == "warning loss: 4 packets lost"
+
+
+# -- read back ------------------------------------------------------------------------------------
+
+
+def test_a_report_is_read_into_what_it_was_written_from() -> None:
+    text = report_text(run())
+    found = report_of("report.json", text)
+    assert report_text(found) == text
+    assert found.sensors[0].ledger == ledger()
+    assert found.sensors[0].clock == run().sensors[0].clock
+    assert found.scans == run().scans
+
+
+def test_what_a_report_lacks_is_empty() -> None:
+    """As reports of earlier versions, and damaged ones."""
+    sensor = {"name": "left", "packets": {"read": "many"}, "points": [], "clock": 5}
+    found = RunReport.from_json({"sensors": [sensor, None], "scans": "x", "timing": {}})
+    assert [one.name for one in found.sensors] == ["left", ""]
+    assert found.sensors[0].ledger == SensorLedger()
+    assert found.sensors[0].body_from_sensor.shape == (0,)
+    assert (found.scans.written, found.timing, found.recorded_s) == (0, None, 0.0)
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("[", "expected a report in JSON, found"),
+        ("[]", "expected a report of schema mlbatch.report/1, found 'none'"),
+        ('{"schema": "x"}', "expected a report of schema mlbatch.report/1, found 'x'"),
+    ],
+)
+def test_another_document_is_no_report(text: str, expected: str) -> None:
+    with pytest.raises(RecordingError, match=f"r.json: {expected}"):
+        report_of("r.json", text)
