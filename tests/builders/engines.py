@@ -49,6 +49,7 @@ class Pair:
         boxes_m: F64Array,
         extras: frozenset[str] = EXTRAS,
     ) -> None:
+        self.sources = sources
         self.decoder = Decoder(info, sources, boxes_m, extras)
         self.literal = LiteralDecoder(sources, np.asarray(boxes_m).reshape(-1, 6))
 

@@ -6,17 +6,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
 from mlbatch.arrays import BoolArray, F64Array, I64Array
 from tests.builders.seen import Seen
-
-# docs/sources/outputs.md section 3.
-STRONGEST_FIRST = 3
-STRONGEST_LAST = 4
-WEAK_FIRST = 5
-WEAK_LAST = 6
-ONLY = 7
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,22 +81,6 @@ def repeated(counts: I64Array) -> BoolArray:
         earlier = counts[:, :, :which] == counts[:, :, which, None]
         again[:, :, which] = earlier.any(axis=2) & (counts[:, :, which] > 0)
     return again
-
-
-def pair_types(counts: I64Array, level: I64Array) -> npt.NDArray[np.uint8]:
-    """(n, channels, 2) types of two returns, by their ranges and levels."""
-    near_first = counts[..., 0] <= counts[..., 1]
-    first_strong = level[..., 0] >= level[..., 1]
-    one = np.where(
-        near_first,
-        np.where(first_strong, STRONGEST_FIRST, WEAK_FIRST),
-        np.where(first_strong, STRONGEST_LAST, WEAK_LAST),
-    )
-    # The nearer is first where the other is last, and one of them is the stronger.
-    types = np.stack([one, STRONGEST_FIRST + WEAK_LAST - one], axis=-1)
-    alone = (counts == 0).any(axis=2) | (counts[..., 0] == counts[..., 1])
-    types[alone] = ONLY
-    return types.astype(np.uint8)
 
 
 def _sorted(sight: Seen, ring_base: int) -> _Sorted:

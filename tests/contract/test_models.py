@@ -38,8 +38,8 @@ from mlbatch.types import Stream
 from mlbatch.units import NS_PER_S
 from tests.builders import livox, points
 from tests.builders.decoded import readings
+from tests.builders.every_model import CASES, ROBOSENSE_NAMES, Sent
 from tests.builders.others import rows
-from tests.golden.test_every_model import CASES, ROBOSENSE_NAMES, Sent
 
 WORDS = ("real recording", "two sources", "one source")
 ADVICE = "see docs/extend.md"
@@ -68,7 +68,7 @@ def encoded() -> frozenset[str]:
 
 
 def _case(make: Callable[..., Sent], words: tuple[str, ...]) -> Stand:
-    """The lidar that a case of test_every_model.py is of."""
+    """The lidar that a case of every_model.py is of."""
     sent = make(*words)
     payloads = sent.seen.payloads
     packets = rows([payload for _, payload in payloads])
@@ -168,7 +168,7 @@ def test_every_model_has_an_encoder_and_a_case(model: SensorModel) -> None:
     row = twins.get(model.name, model.same_packets_as or model.name)
     assert row in encoded(), f"{model.name}: no row in mlbatch/simulate; {ADVICE}"
     named = {VARIANTS.get(words[0], words[0]) for _, words in CASES}
-    missing = f"{model.name}: no case in tests/golden/test_every_model.py; {ADVICE}"
+    missing = f"{model.name}: no case in tests/builders/every_model.py; {ADVICE}"
     assert row in named, missing
 
 

@@ -6,9 +6,9 @@ from pathlib import Path
 
 import pytest
 
+from tests.builders.every_model import CASES, SOURCE, job_of
 from tests.builders.sessions import SMALL, Unit, write_session
 from tests.contract.tree import ROOT, modules, run_python
-from tests.golden.test_every_model import CASES, SOURCE, job_of
 
 
 def test_the_command_line_spares_the_collector() -> None:

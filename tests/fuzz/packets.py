@@ -20,6 +20,7 @@ from mlbatch.simulate.ouster import encode as ouster
 from mlbatch.simulate.robosense import encode as robosense
 from mlbatch.simulate.velodyne import encode as velodyne
 from mlbatch.simulate.velodyne.models import calibration_yaml
+from tests.builders.every_model import CASES
 from tests.builders.livox import (
     CARTESIAN16,
     CARTESIAN32,
@@ -37,7 +38,6 @@ from tests.fuzz.decoding import check_lidar, decode_samples, sampled, try_all
 from tests.fuzz.framing import Part, joined, mutated_parts, parts_of
 from tests.fuzz.harness import BrokenLaw, Target
 from tests.fuzz.mutation import Seeds, mutated, mutated_text
-from tests.golden.test_every_model import CASES
 
 # Parts of an input that are no datagrams: a calibration, its name.
 CALIBRATION, _LIDAR_PORT, DEVICE_PORT = 0, 2368, 7788

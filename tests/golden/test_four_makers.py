@@ -2,7 +2,7 @@
 
 Nothing expected comes from a decoder: stamps, ranges and firing times are those that the encoders
 put into the packets (`tests/builders/seen.py`); windows are those of `tests/reference/batching.py`.
-Organized scans, repeated returns and types: test_every_model.py, test_literal.py.
+Organized scans, repeated returns and types: test_literal.py, tests/sensors/test_round_trip.py.
 Times within a packet are whole ns for these models; what Velodyne and ROBOSENSE packets say of
 themselves is cut to whole us, and that is the time that counts.
 """

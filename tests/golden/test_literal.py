@@ -1,4 +1,4 @@
-"""Every model and mode, and the fixtures, against the literal decoder."""
+"""Every model and mode is recognised; they and the fixtures decode as the literal decoder says."""
 
 from __future__ import annotations
 
@@ -6,14 +6,15 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from mlbatch.discovery.discover import SensorSelection
 from mlbatch.pipeline.job import Job
 from tests.builders import four_makers
 from tests.builders.engines import WANTED, check_conversion
+from tests.builders.every_model import CASES, Sent, job_of
 from tests.builders.run import FIXTURE
-from tests.golden.test_every_model import CASES, Sent, job_of
 
 MAKERS = Job(
     (four_makers.FOLDER / "four_makers.pcap",),
@@ -28,8 +29,16 @@ MAKERS = Job(
     ids=[f"{make.__name__[:-5]} {' '.join(words)}" for make, words in CASES],
 )
 def test_every_model(make: Callable[..., Sent], words: tuple[str, ...], tmp_path: Path) -> None:
-    job = job_of(make(*words), tmp_path)
+    sent = make(*words)
+    assert np.count_nonzero(sent.seen.counts) > sent.seen.counts.size / 10
+    job = job_of(sent, tmp_path)
     pairs = check_conversion(job)
+    lidar = pairs[0].sources[0].lidar
+    assert (lidar.model, lidar.channels, lidar.returns) == (
+        *(sent.model, sent.seen.channels),
+        sent.seen.returns,
+    )
+    assert sent.types in ((), lidar.return_types)
     everything, _, cut, near, *_ = (pair.decoder.counts[0] for pair in pairs)
     assert everything.written > cut.written
     assert cut.box > 0

@@ -26,11 +26,11 @@ from mlbatch.simulate.robosense import models as robosense_models
 from mlbatch.simulate.velodyne import encode as velodyne
 from mlbatch.simulate.velodyne.models import MODELS as VELODYNES
 from mlbatch.simulate.velodyne.models import calibration_yaml
+from tests.builders.every_model import hesai_modes
 from tests.builders.lidar_packets import Payloads, Spec, even, hesai_unit
 from tests.builders.loss import Came
 from tests.fuzz.decoding import sampled
 from tests.fuzz.framing import Part
-from tests.golden.test_every_model import hesai_modes
 
 # Ten revolutions a second; a dark sector is recognised after a dozen.
 LENGTH_NS = 200_000_000

@@ -14,17 +14,17 @@ import pytest
 
 from mlbatch.outputs.stored_scan import COLUMN_NS
 from mlbatch.verification import CHECKS, verify
-from tests.builders.points import STAMP_NS, VELODYNE, cloud_message, write_points
-from tests.builders.rosbag2 import write_rosbag2
-from tests.builders.run import ROOT, command
-from tests.golden.test_bag_sessions import SESSIONS
-from tests.golden.test_every_model import (
+from tests.builders.every_model import (
     Sent,
     hesai_sent,
     job_of,
     robosense_sent,
     velodyne_sent,
 )
+from tests.builders.points import STAMP_NS, VELODYNE, cloud_message, write_points
+from tests.builders.rosbag2 import write_rosbag2
+from tests.builders.run import ROOT, command
+from tests.golden.test_bag_sessions import SESSIONS
 
 SUFFIX = {"mcap": ".mcap", "rosbag1": ".bag"}
 # Checks with values in each format, of merged scans at the standard layout.

@@ -1,7 +1,7 @@
 """Encode, then decode: ranges, levels, times and points are what the encoders were given.
 
 A row is a model in a mode, at a speed, behind a blind sector, of a firmware. Ouster:
-`ouster/test_pixels.py`; Livox: `livox/test_sensor.py`. `tests/golden/test_every_model.py` converts
+`ouster/test_pixels.py`; Livox: `livox/test_sensor.py`. `tests/golden/test_literal.py` converts
 the same models as whole recordings.
 """
 
