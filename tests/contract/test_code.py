@@ -62,15 +62,15 @@ def test_a_plugin_has_tests_and_something_to_test_with(plugin: Module) -> None:
 
 
 def _tests_of(plugin: Module) -> list[Path]:
-    """Test files of a format, or of a vendor; formats may share the files of their package."""
+    """Test files of a vendor, or those with a row of a format."""
     package, *_, name = plugin.name.split(".")
     if package == "sensors":
         return sorted((ROOT / "tests" / Path(*plugin.name.split(".")[:2])).glob("test_*.py"))
-    return [
-        path
-        for path in sorted((ROOT / "tests" / package).rglob("test_*.py"))
-        if path.stem.startswith(f"test_{name}") or f".formats.{name}" in _text(path)
-    ]
+    row = re.compile(
+        rf"""test_{name}|write_{name}|\.formats\.{name}\b|["(]{name}["(]|--format {name}\b"""
+    )
+    files = sorted((ROOT / "tests" / package).rglob("test_*.py"))
+    return [path for path in files if row.search(path.name) or row.search(_text(path))]
 
 
 def _material(plugin: Module) -> bool:
