@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import shutil
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -12,6 +11,7 @@ import numpy as np
 import pytest
 
 from tests.builders.mcaps import write_mcap
+from tests.builders.run import command
 from tests.builders.sessions import (
     EPOCH_NS,
     FIXTURE,
@@ -27,13 +27,31 @@ from tests.builders.sessions import (
     write_session,
 )
 from tests.builders.sessions_of_bags import unit_messages
+from tests.builders.transcripts import transcripts
 
 CAPTURE = FIXTURE / "two_lidars.pcap"
 FIX = f"{CAPTURE} --rig {FIXTURE / 'rig.yaml'}"
+CASES = transcripts("outputs", FIX="fix/two_lidars.pcap --rig fix/rig.yaml")
 # From fixtures/two_lidars/SOURCE.md.
 T_INIT_NS = 1777881600_100_000_000
 POINTS = 27998
 HEAD_POINTS = 22440
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with the fixture, and its conversion."""
+    folder = tmp_path_factory.mktemp("outputs")
+    (folder / "fix").symlink_to(FIXTURE)
+    assert command("convert", *FIX.split(), "-o", folder / "whole", "-q").code == 0
+    return folder
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_transcript(shell: Shell, place: Path, tmp_path: Path, name: str) -> None:
+    for path in place.iterdir():
+        (tmp_path / path.name).symlink_to(path)
+    CASES[name].check(shell, tmp_path)
 
 
 @pytest.fixture
@@ -47,34 +65,6 @@ def dry(shell: Shell) -> Callable[[str], Report]:
         return report
 
     return run
-
-
-@pytest.mark.parametrize(
-    "limits",
-    [
-        "--start 1777881600.3 --end 1777881600.5",
-        "--start 2026-05-04T08:00:00.3 --end 2026-05-04T08:00:00.5Z",
-        "--start 2026-05-04T10:00:00.300000+02:00 --end 1777881600.5",
-        "--start +0.2 --end +0.4",
-        "--start +0.100000001 --end +0.300000001",
-    ],
-)
-def test_limits_keep_index_and_grid(shell: Shell, limits: str) -> None:
-    assert shell(f"convert {FIX} -o out {limits}").code == 0
-    assert names("out") == ["000002.npz", "000003.npz"]
-    assert int(arrays("out/000002.npz")["start_ns"]) == T_INIT_NS + 2 * 100 * NS_PER_MS
-    report = report_of("out/report.json")
-    assert report["grid"]["t_init_ns"] == T_INIT_NS
-    assert report["scans"]["written"] == 2
-    for sensor in report["sensors"]:
-        assert sensor["columns"]["written"] == 2 * 512
-
-
-def test_scans_of_a_part_are_those_of_the_whole(shell: Shell) -> None:
-    shell(f"convert {FIX} -o whole")
-    shell(f"convert {FIX} -o part --start +0.3 --end +0.5")
-    for name in names("part"):
-        assert Path("part", name).read_bytes() == Path("whole", name).read_bytes()
 
 
 def _ledger_balances(report: Report) -> None:
@@ -181,24 +171,6 @@ def test_split_writes_a_folder_a_sensor(shell: Shell) -> None:
         assert (int(part["index"]), bool(part["complete"])) == (4, True)
 
 
-@pytest.mark.parametrize("wish", ["--only right", "--only 122648000456", "--ignore left"])
-def test_sensors_are_chosen_by_name_or_serial(dry: Callable[[str], Report], wish: str) -> None:
-    report = dry(f"{FIX} {wish}")
-    assert [sensor["name"] for sensor in report["sensors"]] == ["right"]
-    left_out = [row for row in report["unassigned"] if row["what"].startswith("ignored: ")]
-    assert [row["packets"] for row in left_out] == [271]
-    assert report["warnings"] == []
-    _ledger_balances(report)
-
-
-def test_overwrite_replaces_the_scans_of_a_run_before(shell: Shell) -> None:
-    assert shell(f"convert {FIX} -o out").code == 0
-    before = Path("out/000000.npz").read_bytes()
-    assert shell(f"convert {FIX} -o out --overwrite --end +0.1").code == 0
-    assert names("out") == ["000000.npz"]
-    assert Path("out/000000.npz").read_bytes() == before
-
-
 def test_checksums_are_checked_on_wish(dry: Callable[[str], Report], tmp_path: Path) -> None:
     capture = write_session(tmp_path, Unit())
     raw = bytearray(capture.read_bytes())
@@ -208,13 +180,6 @@ def test_checksums_are_checked_on_wish(dry: Callable[[str], Report], tmp_path: P
     packets = dry(f"{capture} --decode crc=check")["sensors"][0]["packets"]
     assert packets["rejected"] == {"bad_crc": 1}
     assert packets["lost"] == 1
-
-
-def test_a_rate_that_is_no_whole_number_is_kept_exact(dry: Callable[[str], Report]) -> None:
-    report = dry(f"{FIX} --rate 29.97")
-    assert report["grid"]["rate_hz"] == "29.97"
-    assert report["grid"]["period_ns"] == "100000000000/2997"
-    assert (report["scans"]["incomplete"], report["scans"]["empty"]) == (0, 0)
 
 
 def test_host_clock_makes_uptime_clocks_comparable(
@@ -235,18 +200,3 @@ def test_a_terminal_obeys_no_topic(shell: Shell, tmp_path: Path) -> None:
     assert outcome.code == 0, outcome.err
     assert outcome.out.startswith("ouster_111: ")
     assert r"calibration /a\x1b[31m\x07\n/ouster/metadata" in outcome.out
-
-
-@pytest.mark.parametrize(
-    "name",
-    ["partial", "partial.state", "scans.csv", "scans.csv.partial", "report.json", "old.partial"],
-)
-def test_files_beside_an_output_are_no_recordings(shell: Shell, tmp_path: Path, name: str) -> None:
-    """A run would have removed them, or written over them."""
-    recording = Path(f"drive.mcap.{name}")
-    shutil.copy(CAPTURE, recording)
-    outcome = shell(f"convert {recording} --identity-extrinsics -o drive.mcap")
-    assert outcome.code == 1
-    assert f"expected an output that does not overwrite {recording}, found one" in outcome.err
-    assert recording.read_bytes() == CAPTURE.read_bytes()
-    assert [path.name for path in tmp_path.iterdir()] == [recording.name]
