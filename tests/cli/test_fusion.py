@@ -132,6 +132,13 @@ def test_reused_columns_are_counted(shell: Shell) -> None:
     assert shell("verify out").code == 0
 
 
+def test_bytes_do_not_depend_on_jobs(shell: Shell) -> None:
+    words = f"{WORDS} --batching latest --batching-times own"
+    assert shell(f"{words} -o one.mcap --jobs 1").code == 0
+    assert shell(f"{words} -o two.mcap --jobs 3").code == 0
+    assert Path("one.mcap").read_bytes() == Path("two.mcap").read_bytes()
+
+
 # -- stamps ---------------------------------------------------------------------------------------
 
 
