@@ -35,7 +35,7 @@ class Step:
             done = subprocess.run(["sh", "-c", self.words], capture_output=True, text=True)
             self._compare(done.stdout + done.stderr, done.returncode)
             return
-        before = _files(folder)
+        before = _files(folder, self.code)
         words, _, filtered_by = self.words.removeprefix("mlbatch ").partition(" | ")
         outcome = shell(words)
         printed = outcome.out
@@ -46,7 +46,7 @@ class Step:
             printed = done.stdout
         self._compare(printed + outcome.err, outcome.code)
         if outcome.code not in LEAVES_OUTPUT:
-            assert _files(folder) == before
+            assert _files(folder, self.code) == before
 
     def _compare(self, printed: str, code: int) -> None:
         found = [line for line in printed.splitlines() if line]
@@ -96,6 +96,6 @@ def transcripts(name: str, **variables: str) -> Mapping[str, Transcript]:
     return {name: Transcript(tuple(steps)) for name, steps in found.items()}
 
 
-def _files(folder: Path) -> list[Path]:
-    """All files under a final name."""
-    return sorted(path for path in folder.rglob("*") if ".partial" not in str(path))
+def _files(folder: Path, code: int) -> list[Path]:
+    """All files under a final name; with wrong usage (2) there are no others, either."""
+    return sorted(path for path in folder.rglob("*") if code == 2 or ".partial" not in str(path))
