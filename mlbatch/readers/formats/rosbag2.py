@@ -13,7 +13,7 @@ import shutil
 import sqlite3
 import tempfile
 import weakref
-from collections.abc import Generator, Sequence
+from collections.abc import Generator, Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -42,6 +42,8 @@ _PAGE_SIZE_AT = 16
 _CHANGES_AT = 24
 _PAGES_AT = 28
 _VALID_FOR_AT = 92
+# Kind of a page: rows of a table.
+_TABLE_LEAF = 13
 # Most bytes to write where the header of a compressed database does not state its size.
 _MOST_BYTES = 1 << 40
 _COMPUTED = re.compile(r"\b(virtual|as)\b")
@@ -155,6 +157,7 @@ class _Database:
                 self._indexed = _has_time_index(connection)
                 self.first_ns = self._edge_ns(connection, "ASC")
                 self.last_ns = self._edge_ns(connection, "DESC")
+                self._cut = self._cut_messages(connection)
         except (sqlite3.Error, LookupError, TypeError, ValueError) as err:
             raise RecordingError(
                 f"{path}: expected a ROS 2 bag (tables topics and messages), found a database that "
@@ -217,6 +220,29 @@ class _Database:
             return None
         return row[0] if row is not None and isinstance(row[0], int) else None
 
+    def _cut_messages(self, connection: sqlite3.Connection) -> frozenset[int]:
+        """Numbers of messages in a last page that is cut off, whose end SQLite reads as zeros."""
+        with self._plain.open("rb") as file:
+            head = file.read(_HEAD_BYTES)
+            page_bytes = _page_bytes(head)
+            size = file.seek(0, 2)
+            part = size % page_bytes
+            if not part or size > _database_bytes(head, self.path):
+                return frozenset()
+            file.seek(size - part)
+            page = file.read(part)
+        found = f"expected {page_bytes} bytes, found {part}"
+        note = CutOff(f"{self.path.name}: its last page was cut off: {found}")
+        self.notes += [] if self.notes else [note]
+        if page[0] == _TABLE_LEAF:
+            return frozenset(_cut_rows(page, page_bytes))
+        # The page continues another one, or is of an index: of the message that was written last.
+        with contextlib.suppress(sqlite3.DatabaseError):
+            row = connection.execute("SELECT max(id) FROM messages").fetchone()
+            return frozenset() if row[0] is None else frozenset(row)
+        # Reported when the table is read.
+        return frozenset()
+
     def portions(
         self, numbers: dict[int, int], buffer: U8Array, damage: _Damage
     ) -> Generator[Portion, None, None]:
@@ -231,7 +257,7 @@ class _Database:
         by_id = _BY_ID.format(marks)
         query = _BY_TIME.format(marks) if self._indexed else by_id
         with contextlib.closing(self._connect()) as connection:
-            page = _Page(name, numbers, buffer, damage)
+            page = _Page(name, numbers, buffer, damage, self._cut)
             has_more = True
             while has_more:
                 try:
@@ -254,14 +280,21 @@ class _Page:
     """Messages of one portion, copied into a reused buffer."""
 
     def __init__(
-        self, name: str, numbers: dict[int, int], buffer: U8Array, damage: _Damage
+        self,
+        name: str,
+        numbers: dict[int, int],
+        buffer: U8Array,
+        damage: _Damage,
+        cut: frozenset[int],
     ) -> None:
+        """cut: numbers of messages that are not whole."""
         # (begin, end, log time, topic)
         self.rows: list[tuple[int, int, int, int]] = []
         self._name = name
         self._numbers = numbers
         self._buffer = buffer
         self._damage = damage
+        self._cut = cut
         # Time and number of the last message read, of all portions.
         self._last = _BEFORE_ALL
 
@@ -279,6 +312,10 @@ class _Page:
                     if not isinstance(data, bytes) or not isinstance(log_ns, int):
                         self._damage.add(f"{self._name}: a message without bytes or time")
                         last = (last[0], number)
+                        continue
+                    if number in self._cut:
+                        self._damage.lost += 1
+                        last = (log_ns, number)
                         continue
                     if data.startswith(ZSTD_MAGIC):
                         # `ros2 bag record --compression-mode message` compresses each message.
@@ -313,14 +350,50 @@ def _database_bytes(head: bytes, path: Path) -> int:
             f"{path}: expected a compressed SQLite database, found one that begins with "
             f"{head[:8].hex(' ')}; record or copy it again"
         )
-    page_bytes = int.from_bytes(head[_PAGE_SIZE_AT : _PAGE_SIZE_AT + 2], "big")
     changes = int.from_bytes(head[_CHANGES_AT : _CHANGES_AT + 4], "big")
     pages = int.from_bytes(head[_PAGES_AT : _PAGES_AT + 4], "big")
     valid_for = int.from_bytes(head[_VALID_FOR_AT : _VALID_FOR_AT + 4], "big")
     # Old versions of SQLite do not update the number of pages.
     if not pages or changes != valid_for:
         return _MOST_BYTES
-    return pages * (1 << 16 if page_bytes == 1 else page_bytes)
+    return pages * _page_bytes(head)
+
+
+def _page_bytes(head: bytes) -> int:
+    """Size of the pages by the header; 1 stands for 65536."""
+    size = int.from_bytes(head[_PAGE_SIZE_AT : _PAGE_SIZE_AT + 2], "big")
+    return 1 << 16 if size < 2 else size
+
+
+def _cut_rows(page: bytes, page_bytes: int) -> Iterator[int]:
+    """Numbers of the rows of a page of a table that are not whole (SQLite file format, 1.6).
+
+    page: as much of it as there is.
+    """
+    for place in range(8, 8 + 2 * int.from_bytes(page[3:5], "big"), 2):
+        begin = int.from_bytes(page[place : place + 2], "big")
+        # Two integers of 7 bits a byte: the size of the row and its number.
+        values = []
+        value = 0
+        for end, byte in enumerate(page[begin : begin + 18], begin + 1):
+            value = value << 7 | byte & 0x7F
+            if byte < 0x80:
+                values.append(value)
+                value = 0
+            if len(values) == 2:
+                if end + _bytes_in_page(values[0], page_bytes) > len(page):
+                    yield values[1]
+                break
+
+
+def _bytes_in_page(row_bytes: int, page_bytes: int) -> int:
+    """How much of a row is in its own page; the rest of a long one, and 4 bytes, lead to others."""
+    most = page_bytes - 35
+    if row_bytes <= most:
+        return row_bytes
+    least = (page_bytes - 12) * 32 // 255 - 23
+    kept = least + (row_bytes - least) % (page_bytes - 4)
+    return (kept if kept <= most else least) + 4
 
 
 def _tables(connection: sqlite3.Connection) -> set[str]:

@@ -324,6 +324,27 @@ def test_rows_that_are_no_messages_are_counted(tmp_path: Path) -> None:
     assert recording.counts.skipped == {"truncated": 2}
 
 
+def test_a_message_in_a_page_that_is_cut_off_is_counted(tmp_path: Path) -> None:
+    """SQLite reads zeros for the missing bytes: a packet that looks whole and is not."""
+    path = write_rosbag2(tmp_path / "a.db3", SENT)
+    content = path.read_bytes()
+    page_bytes = int.from_bytes(content[16:18], "big")
+    for bytes_ in (1, 2, 7, 64):
+        path.write_bytes(content[:-bytes_])
+        recording = open_bag(path)
+        seen = read(recording)
+        # Where zeros make no row, SQLite stops before it.
+        assert seen == PACKETS[: len(seen)]
+        assert len(PACKETS) - len(seen) in ((1,) if bytes_ == 1 else (1, 2))
+        assert recording.counts.skipped in ({"truncated": 1}, {"truncated": 2})
+        found = f"expected {page_bytes} bytes, found {page_bytes - bytes_}"
+        assert recording.notes[0] == f"a.db3: its last page was cut off: {found}"
+    # What follows the pages is no part of the database.
+    path.write_bytes(content + b"more")
+    recording = open_bag(path)
+    assert (read(recording), recording.notes) == (PACKETS, [])
+
+
 # -- refusals -------------------------------------------------------------------------------------
 
 

@@ -238,7 +238,8 @@ def test_what_is_whole_of_a_cut_bag_is_read(name: str, tmp_path: Path) -> None:
         ends.append(at)
     rng = random.Random(12)
     shares = [0.3, 0.5, 0.75, 0.9, *(rng.uniform(0.3 if least else 0.0, 1) for _ in range(25))]
-    for size in [int(share * len(content)) for share in shares] + [len(content) - 1] * (not least):
+    sizes = [int(share * len(content)) for share in shares]
+    for size in (*sizes, *(len(content) - bytes_ for bytes_ in (1, 10, 99))):
         path.write_bytes(content[: max(size, 64)])
         recording = open_bag(path, buffer_bytes=4096)
         seen = read(recording)
