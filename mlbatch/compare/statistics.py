@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from array import array
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 
 import numpy as np
 
@@ -105,18 +105,9 @@ class SetReport:
 
     def as_json(self) -> dict[str, str | int | dict[str, float | None]]:
         """The policy in the JSON document."""
-        return {
-            "policy": self.policy,
-            "sets": self.sets,
-            "without_a_sensor": self.without_a_sensor,
-            "stale": self.stale,
-            "span_ms": asdict(self.span_ms),
-            "apart_ms": asdict(self.apart_ms),
-            "columns": self.columns,
-            "used_twice": self.used_twice,
-            "never_used": self.never_used,
-            "latency_ms": asdict(self.latency_ms),
-        }
+        found = asdict(replace(self, series=None))
+        del found["series"]
+        return found
 
 
 class SetStatistics:

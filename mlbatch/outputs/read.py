@@ -205,7 +205,7 @@ class _Run:
         self._where = where
         known = None if report is None else report_of(where, report)
         if metadata.sensors is None or metadata.rate is None:
-            if known is None:
+            if known is None or not (known.sensors and known.rate_hz):
                 raise RecordingError(
                     f"{where}: expected the report of the run, which has rate and sensors, found "
                     "none; put it back where `convert` wrote it"
