@@ -56,7 +56,7 @@ def read_outcome(text: str) -> Outcome:
 
 
 def describe(outcome: Outcome, folder: Path) -> str:
-    """Return one sentence on the result and one line a file."""
+    """Return one sentence on the result and one line per file."""
     lidars = f"{len(outcome.names)} lidars ({', '.join(outcome.names)})"
     period = f"{float(outcome.period_ms):g} ms"
     return f"""

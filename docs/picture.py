@@ -1,4 +1,4 @@
-"""Draw a merged scan as PNG: a top view and an oblique view, one colour a lidar.
+"""Draw a merged scan as PNG: a top view and an oblique view, one colour per lidar.
 
     python docs/picture.py SCANS_DIR_OR_NPZ OUT.png [--below METRES]
 

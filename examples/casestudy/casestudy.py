@@ -1,4 +1,4 @@
-"""Lidar-inertial odometry on batches of one and two lidars, in N slices a window, in two forests.
+"""Lidar-inertial odometry on batches of one and two lidars, in N slices per window, in two forests.
 
     python casestudy.py --seeds 3            # `make casestudy`
 

@@ -56,7 +56,7 @@ VARIANTS = (
     _joined("latest", "own", "latest sweeps, times as they come", False),
     _joined("latest", "common", "latest sweeps, times corrected", False),
     Variant("one lidar, windows", one_lidar=True),
-    Variant("2 slices a window", ("--slices", "2"), slices=2),
+    Variant("2 slices per window", ("--slices", "2"), slices=2),
 )
 
 

@@ -92,7 +92,7 @@ class Batch:
             return
         executor: Executor = Threads(self.workers)
         if self.scheduler:
-            # All at once, so that workers that join later get some; else one a thread.
+            # All at once, so that workers that join later get some; else one per thread.
             executor = Dask(self.scheduler, None if self.fail_fast else len(waiting))
         outcomes: SimpleQueue[Outcome] = SimpleQueue()
         running = 0

@@ -83,7 +83,7 @@ class Batcher:
     ) -> None:
         """Arguments of a run.
 
-        intakes: one a sensor; paces: one a sensor, or none where the rates are unknown; merge:
+        intakes: one per sensor; paces: one per sensor, or none where the rates are unknown; merge:
         shared with the fusion of sweeps, or None.
         """
         self._grid = grid
@@ -103,7 +103,7 @@ class Batcher:
     def push(self, accepted: Sequence[Accepted | None], host_ns: I64Array) -> Iterator[Window]:
         """Deliver a batch; yield every window that it closes.
 
-        accepted: one a sensor; host_ns: (P,) receive times of the whole batch, by position.
+        accepted: one per sensor; host_ns: (P,) receive times of the whole batch, by position.
         """
         self._refuse_jumps(accepted)
         ranks, position = ranked(accepted)

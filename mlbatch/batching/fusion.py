@@ -55,7 +55,7 @@ class SweepFusion:
     """
 
     def __init__(self, policy: str, cutters: Sequence[SweepCutter], merge: ColumnMerge) -> None:
-        """policy: a word of POLICIES; cutters: one a sensor."""
+        """policy: a word of POLICIES; cutters: one per sensor."""
         self._policy = POLICIES[policy](len(cutters))
         self._cutters = list(cutters)
         self._merge = merge

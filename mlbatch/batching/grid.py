@@ -18,7 +18,7 @@ class Grid:
     """Windows of 1 / rate seconds since time 0, each divided into `slices` equal slices.
 
     Slice j of window k has the number q = k * slices + j and covers [bound(q), bound(q + 1)). With
-    one slice a window, q is the number of the window.
+    one slice per window, q is the number of the window.
     """
 
     rate: Fraction
@@ -32,7 +32,7 @@ class Grid:
         if self.rate <= 0:
             raise UsageError(f"rate: expected a positive number of Hz, found {self.rate}")
         if self.slices < 1:
-            raise UsageError(f"slices: expected 1 or more a window, found {self.slices}")
+            raise UsageError(f"slices: expected 1 or more per window, found {self.slices}")
         object.__setattr__(self, "_count", self.rate.numerator * self.slices)
         object.__setattr__(self, "_per_ns", NS_PER_S * self.rate.denominator)
 

@@ -247,7 +247,7 @@ def _in_order(parts: list[_Packets]) -> _Packets:
 
 def _missing(packets: _Packets, packet_ns: float) -> int:
     """Number of packets missing between these, which are sorted by stamp."""
-    # Packets of equal stamps (one a return) count as one.
+    # Packets of equal stamps (one per return) count as one.
     is_next = np.diff(packets.stamp_ns, prepend=packets.stamp_ns[:1] - 1) > 0
     if not is_next.all():
         packets = packets.take(is_next)

@@ -31,7 +31,8 @@ def batch(
         ),
     ],
     output: Annotated[
-        str, typer.Option("-o", "--output", help="Folder (or s3:// URL); a folder a session in it.")
+        str,
+        typer.Option("-o", "--output", help="Folder (or s3:// URL); one folder per session in it."),
     ],
     rig: Annotated[
         str | None,

@@ -68,7 +68,7 @@ def run(job: Job, target: Target) -> None:
 
 
 def _run_one(job: Job, target: Target) -> list[str]:
-    """Make one output; returns what exceeds limits of `--fail-on`, a line each."""
+    """Make one output; return one line for each limit of `--fail-on` that is exceeded."""
     if job.shard is not None:
         _check_shard(target)
     request = target.request
@@ -89,7 +89,7 @@ def _run_one(job: Job, target: Target) -> list[str]:
         return []
     _write_page(conversion, report, target)
     if target.prints_report or (request.dry_run and report_path is None):
-        # One line a segment: several JSON documents in a row are no document.
+        # One line per segment: several JSON documents in a row are no document.
         typer.echo(report_text(report, in_a_line=target.split_jumps), nl=False)
     elif not target.quiet:
         _print_summary(conversion, report, target, report_path)
@@ -232,7 +232,7 @@ def _print_sensors(conversion: Conversion) -> None:
 def _run_segments(job: Job, target: Target) -> list[str]:
     """Convert each segment between clock steps; a step is found when a segment reaches it.
 
-    Returns what exceeds limits of `--fail-on`, a line each.
+    Returns one line for each limit of `--fail-on` that is exceeded.
     """
     beyond = []
     if job.faults:

@@ -27,7 +27,7 @@ from mlbatch.types import (
 
 __all__ = ["Decoder", "ScanHeader", "Source", "WindowColumns"]
 
-# Counts of the points of a scan, one list a sensor, in the order of `ledger.POINT_COUNTERS`.
+# Counts of the points of a scan, one list per sensor, in the order of `ledger.POINT_COUNTERS`.
 PointOutcomes: TypeAlias = Sequence[Sequence[int]]
 
 

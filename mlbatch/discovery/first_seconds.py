@@ -20,7 +20,7 @@ import numpy as np
 from mlbatch import sensors
 from mlbatch.clocks.compare import COMPARABLE_NS
 from mlbatch.discovery.calibrations import MetadataCollector, subscribe
-from mlbatch.discovery.sampler import Crowd, Sampler, split_by_kind
+from mlbatch.discovery.sampler import KindFilter, Sampler, split_by_kind
 from mlbatch.discovery.types import DetectedSensor, Note
 from mlbatch.errors import RigError
 from mlbatch.native.capture import CaptureLoops
@@ -102,11 +102,11 @@ class FirstSeconds:
         self, by_log_time: ByLogTime | None = None, seen: Seen | None = None
     ) -> Iterator[PacketBatch]:
         end_ns: int | None = None
-        crowd = Crowd()
+        kind_filter = KindFilter()
         with contextlib.closing(self._merged(by_log_time, seen)) as batches:
             for batch in batches:
                 if end_ns is None:
-                    begin_ns = _first_lidar_host_ns(batch, crowd)
+                    begin_ns = _first_lidar_host_ns(batch, kind_filter)
                     end_ns = None if begin_ns is None else begin_ns + FIRST_NS
                 if end_ns is None:
                     yield batch
@@ -206,13 +206,13 @@ class FirstSeconds:
         )
 
 
-def _first_lidar_host_ns(batch: PacketBatch, crowd: Crowd) -> int | None:
+def _first_lidar_host_ns(batch: PacketBatch, kind_filter: KindFilter) -> int | None:
     """Receive time of the first packet of a kind that is described as a lidar's.
 
     Several packets are checked: device packets may come first on the same topic.
     """
     begins_ns = []
-    for kind, index in crowd.followed(batch, split_by_kind(batch)):
+    for kind, index in kind_filter.followed(batch, split_by_kind(batch)):
         begins = batch.start[index[:_CHECKED]].tolist()
         checked = np.stack([batch.data[begin : begin + kind.size] for begin in begins])
         text = sensors.describe(kind.size, checked)

@@ -20,7 +20,7 @@ import numpy as np
 from mlbatch import sensors
 from mlbatch.arrays import I64Array
 from mlbatch.batching.intake import NEVER, extremes
-from mlbatch.discovery.sampler import Crowd, split_by_kind
+from mlbatch.discovery.sampler import KindFilter, split_by_kind
 from mlbatch.discovery.types import DetectedSensor
 from mlbatch.errors import MlbatchError, RecordingError
 from mlbatch.lidar.headers import content_keys
@@ -305,7 +305,7 @@ def _lidars(
     batch: PacketBatch, table: StreamTable, is_wanted: Callable[[Stream, str], bool]
 ) -> Iterator[str]:
     """Lidars whose packets are in a batch."""
-    for kind, index in Crowd().followed(batch, split_by_kind(batch)):
+    for kind, index in KindFilter().followed(batch, split_by_kind(batch)):
         stream = table.streams[kind.stream]
         packets = batch.data[batch.start[index[:_CHECKED], None] + np.arange(kind.size)]
         what = sensors.describe(kind.size, packets)

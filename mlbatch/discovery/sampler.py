@@ -62,14 +62,14 @@ class KindSamples:
 
 
 @dataclass(slots=True)
-class Crowd:
+class KindFilter:
     """Decides which packet kinds are followed, where port scans, file transfers or video send many.
 
     The first kinds are followed one by one. A later kind is only counted, until it has sent some
     packets and a vendor recognises one of them: memory and time do not grow with streams that no
     sensor sends, and a lidar that starts last is found.
 
-    packets: those that were not, so far; kinds: how many kinds they are of, at least.
+    packets: number of packets that were only counted; kinds: least number of their kinds.
     """
 
     packets: int = 0
@@ -80,7 +80,7 @@ class Crowd:
     def followed(
         self, batch: PacketBatch, parts: list[tuple[PacketKind, I64Array]]
     ) -> list[tuple[PacketKind, I64Array]]:
-        """The kinds to follow among those of a batch, and the rows from which on.
+        """Return the kinds of a batch to follow, each with its rows from the first one followed.
 
         parts: kinds with their rows, as by `split_by_kind`. All other packets are counted. The
         result does not depend on the size of batches.
@@ -129,20 +129,20 @@ def _is_recognised(batch: PacketBatch, kind: PacketKind, row: int) -> bool:
 class Sampler:
     """Keeps the first packets of every kind and some later ones, and counts them all.
 
-    crowd: decides which kinds, where there are very many; released: descriptions of kinds whose
-    payloads are no longer kept.
+    kind_filter: decides which kinds to follow if there are very many; released: descriptions of
+    kinds whose payloads are no longer kept.
     """
 
     table: StreamTable
     # Samples of each kind, in receive order of their first packets.
     kinds: dict[PacketKind, KindSamples] = field(default_factory=dict)
-    crowd: Crowd = field(default_factory=Crowd)
+    kind_filter: KindFilter = field(default_factory=KindFilter)
     released: dict[PacketKind, str | None] = field(default_factory=dict)
     _kinds_of_ip: dict[str, list[PacketKind]] = field(default_factory=dict)
 
     def add(self, batch: PacketBatch) -> None:
         """Sample a batch."""
-        for kind, index in self.crowd.followed(batch, split_by_kind(batch)):
+        for kind, index in self.kind_filter.followed(batch, split_by_kind(batch)):
             first_ns = int(batch.host_ns[index[0]])
             samples = self.kinds.get(kind) or self._new(kind, first_ns)
             for row in _rows_to_keep(samples, kind, index, batch):
@@ -166,7 +166,7 @@ class Sampler:
         """Count from zero in another pass, by `count`; samples are kept."""
         for samples in self.kinds.values():
             samples.packets = 0
-        self.crowd.packets = 0
+        self.kind_filter.packets = 0
 
     def count(self, kind: PacketKind, index: I64Array, batch: PacketBatch) -> bool:
         """Count the packets of a kind at `index` of a batch; True if the kind is new.
@@ -195,7 +195,7 @@ class Sampler:
         total = sum(sizes.values())
         if not total:
             return 0.0
-        unfollowed = self.crowd.packets * total / packets
+        unfollowed = self.kind_filter.packets * total / packets
         return sum(size for kind, size in sizes.items() if kind in kinds) / (total + unfollowed)
 
     def evidence(self, kind: PacketKind) -> Evidence:

@@ -180,7 +180,7 @@ class Mirrors(NamedTuple):
 class PlacedPoints(NamedTuple):
     """Points that are recorded with coordinates.
 
-    first_byte: in a record, of the planes x, y, z and intensity (float32, one value a slot);
+    first_byte: in a record, of the planes x, y, z and intensity (float32, one value per slot);
     rotation: (3, 3); translation_m: (3,).
     """
 

@@ -96,7 +96,7 @@ class PacedBlocks(NamedTuple):
 
 
 class DatedGroups(NamedTuple):
-    """Packets with a date, and blocks with an azimuth each, one a return: HESAI.
+    """Packets with a date, and blocks with an azimuth each, one block per return: HESAI.
 
     A column is a group of blocks. Its time is that of the packet, plus `base_ns`, plus a step for
     each group, plus `first_ns` of its firing table.

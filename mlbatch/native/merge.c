@@ -91,7 +91,7 @@ EXPORT int64_t mlbatch_merge(int64_t part_count, const Part *parts, int64_t unti
 }
 
 /* Rotor positions are a share of `positions`, and those beyond it are at its ends; 0: rotor words,
-   2**32 ticks a revolution. */
+   2**32 ticks per revolution. */
 static int64_t sector_of(int64_t encoder, int64_t positions, int64_t sectors)
 {
     if (!positions)

@@ -71,7 +71,7 @@ enum { INT32_MM, INT16_CM, SPHERICAL_MM };
 
 enum { NOT_TYPED, TYPED_BY_ORDER, TYPED_BY_LEVEL };
 
-/* Planes of CORRECTED, one value a beam: cosine and sine of the angle on the rotor and above it,
+/* Planes of CORRECTED, one value per beam: cosine and sine of the angle on the rotor and above it,
    offsets, and three ranges: correction far, and value at 0 m and slope aside and ahead. */
 enum {
     TURN_COSINE,

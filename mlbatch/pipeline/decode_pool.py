@@ -16,7 +16,7 @@ from mlbatch.report.ledger import PointCounts
 from mlbatch.types import NO_COLUMNS, ColumnFigures, Scan, WindowColumns
 from mlbatch.writers.point_layouts import clipped_points
 
-# Counts of the points of a scan, one list a sensor, in the order of `ledger.POINT_COUNTERS`.
+# Counts of the points of a scan, one list per sensor, in the order of `ledger.POINT_COUNTERS`.
 Outcomes: TypeAlias = Sequence[Sequence[int]]
 # Gives a decoder of these sensors; with `--split` of one sensor, whose index is the second.
 NewDecoder: TypeAlias = Callable[[Sequence[Source], int | None], Decoder]
@@ -51,7 +51,7 @@ class DecodeTask:
 
 
 class Decoded(NamedTuple):
-    """A scan, and the counts of its points, one list a sensor; none if they were not asked for."""
+    """A scan and the counts of its points, one list per sensor; empty if not requested."""
 
     scan: Scan
     outcomes: list[list[int]]
@@ -121,7 +121,7 @@ class DecodePool:
         counts_clipped: bool = False,
         own_times: bool = False,
     ) -> None:
-        """workers: one a thread.
+        """workers: one per thread.
 
         own_times: times of points count from the first column of their sensor.
         """

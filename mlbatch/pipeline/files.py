@@ -64,7 +64,7 @@ class FinishedScan(NamedTuple):
     """A scan in a file that is whole.
 
     window: its index; sensor: with `--split`; content: checksum of what was read for it and before
-    it, see `Files.take`; checksum: see `ScanJob`; outcomes: slots by outcome, one list a sensor,
+    it, see `Files.take`; checksum: see `ScanJob`; outcomes: slots by outcome, one list per sensor,
     see `ledger.POINT_COUNTERS`.
     """
 

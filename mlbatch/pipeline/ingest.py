@@ -10,7 +10,7 @@ import numpy as np
 from mlbatch.arrays import BoolArray, I64Array, U8Array
 from mlbatch.batching.intake import Accepted, Arrival, Intake, Payloads
 from mlbatch.discovery.router import Role, Router
-from mlbatch.discovery.sampler import SAMPLES_PER_KIND, Crowd, split_by_kind
+from mlbatch.discovery.sampler import SAMPLES_PER_KIND, KindFilter, split_by_kind
 from mlbatch.discovery.types import PacketKind
 from mlbatch.lidar.headers import Headers
 from mlbatch.lidar.interface import Lidar
@@ -77,8 +77,8 @@ IsIgnored = Callable[[PacketKind, U8Array], BoolArray]
 class Ingest:
     """Assigns packets to sensors and takes their columns in; pixels stay raw.
 
-    intakes: one a sensor; unassigned: packets of no sensor; crowd: decides which kinds of them are
-    listed.
+    intakes: one per sensor; unassigned: packets of no sensor; kind_filter: decides which of their
+    kinds are listed.
     """
 
     def __init__(
@@ -91,7 +91,7 @@ class Ingest:
     ) -> None:
         """stamp_map: applied to timestamps before they are batched; None: unchanged."""
         self.unassigned: dict[UnassignedKey, UnassignedPackets] = {}
-        self.crowd = Crowd()
+        self.kind_filter = KindFilter()
         self._is_ignored = is_ignored
         self._router = router
         self._sensors = list(sensors)
@@ -128,7 +128,7 @@ class Ingest:
         if not owned.all():
             unassigned += [(kind, index[~owned[index]]) for kind, index in shared]
         left = [(kind, index) for kind, index in unassigned if len(index)]
-        for kind, index in self.crowd.followed(batch, left):
+        for kind, index in self.kind_filter.followed(batch, left):
             self._unassign(kind, batch, index)
         return ingested
 

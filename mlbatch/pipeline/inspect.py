@@ -410,11 +410,11 @@ def _notes(discovery: Discovery) -> Iterator[str]:
         problem = shared_address(discovery.sampler, sensor)
         if problem:
             yield problem
-    crowd = discovery.sampler.crowd
-    if crowd.packets:
+    unfollowed = discovery.sampler.kind_filter
+    if unfollowed.packets:
         yield (
-            f"{crowd.packets} packets of at least {crowd.kinds} other streams or sizes are not "
-            f"listed: only the first {MOST_KINDS} are, and those that a vendor recognises"
+            f"{unfollowed.packets} packets of at least {unfollowed.kinds} other streams or sizes "
+            f"are not listed: only the first {MOST_KINDS} are, and those that a vendor recognises"
         )
     if not discovery.sampler.kinds:
         yield "no UDP packet in the first 10 seconds"
@@ -524,7 +524,7 @@ def _measure(
         if progress is not None:
             progress(sum(recording.position_bytes for recording in recordings), size_bytes)
         if whole:
-            for kind, index in sampler.crowd.followed(batch, split_by_kind(batch)):
+            for kind, index in sampler.kind_filter.followed(batch, split_by_kind(batch)):
                 if sampler.count(kind, index, batch):
                     late.add(kind)
         measured.add(batch)

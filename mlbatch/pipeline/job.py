@@ -67,10 +67,10 @@ class Job:
     recordings: tuple[Path, ...]
     selection: SensorSelection = field(default_factory=SensorSelection)
     rate: Fraction | None = None  # Hz; None: the rig's, else 10
-    slices: int = 1  # sub-scans a window
+    slices: int = 1  # sub-scans per window
     layout: str = "dense"  # or organized
     sort: str = "columns"  # or points: order of the points of a scan
-    split: bool = False  # one scan a sensor instead of merged ones
+    split: bool = False  # one scan per sensor instead of merged ones
     keep_partial: bool = False  # also the first and the last, partial window
     keep_repeated: bool = False  # the second of two equal returns of a shot
     drop_incomplete: float = 0.0  # percent of the columns of every sensor that a window must have

@@ -12,7 +12,7 @@ from mlbatch.discovery.discover import Discovery
 from mlbatch.discovery.first_seconds import FIRST_NS
 from mlbatch.discovery.overlap import LidarSpan, SharedLidars, lidar_name, problem
 from mlbatch.discovery.router import Role
-from mlbatch.discovery.sampler import SAMPLES_PER_KIND, Crowd, split_by_kind
+from mlbatch.discovery.sampler import SAMPLES_PER_KIND, KindFilter, split_by_kind
 from mlbatch.discovery.types import PacketKind
 from mlbatch.errors import RecordingError
 from mlbatch.types import PacketBatch, Recording
@@ -25,7 +25,7 @@ class RunOverlap:
         self._setup = setup
         self._spans = {id(one): LidarSpan(one.path) for one in recordings}
         self._shared = SharedLidars()
-        self._crowds = {id(one): Crowd() for one in recordings}
+        self._kind_filters = {id(one): KindFilter() for one in recordings}
         # By recording and kind, as lidars of several recordings may have one address.
         self._lidars: dict[tuple[int, PacketKind], list[str]] = {}
         self._begun_ns: int | None = None
@@ -39,7 +39,7 @@ class RunOverlap:
             return
         is_new = span.first_ns is None
         parts = split_by_kind(batch)
-        for kind, index in self._crowds[id(recording)].followed(batch, parts):
+        for kind, index in self._kind_filters[id(recording)].followed(batch, parts):
             key = id(recording), kind
             names = self._lidars.get(key)
             if names is None:

@@ -449,10 +449,12 @@ def _unassigned(run: Conversion) -> tuple[Unassigned, ...]:
             what = f"not_in_rig: {what}"
         count = run.session.ingest.unassigned[kind, ignored].packets
         rows.append(Unassigned(str(streams[kind.stream]), count, f"{what} ({kind.size} bytes)"))
-    crowd = run.session.ingest.crowd
-    if crowd.packets:
-        what = f"unknown: at least {crowd.kinds} streams or sizes after the first {MOST_KINDS}"
-        rows.append(Unassigned("other streams", crowd.packets, what))
+    kind_filter = run.session.ingest.kind_filter
+    if kind_filter.packets:
+        what = (
+            f"unknown: at least {kind_filter.kinds} streams or sizes after the first {MOST_KINDS}"
+        )
+        rows.append(Unassigned("other streams", kind_filter.packets, what))
     return tuple(rows)
 
 

@@ -104,7 +104,7 @@ class SensorLedger:
     imu_samples: DecodedCounts = field(default_factory=DecodedCounts)
 
     def check(self) -> list[str]:
-        """Counters that do not balance, a line each; empty if all do."""
+        """One line for each counter that does not balance; empty if all do."""
         packets = self.packets
         columns = self.columns
         points = self.points
@@ -125,7 +125,7 @@ class SensorLedger:
 
 
 def check_capture(counts: CaptureCounts) -> list[str]:
-    """Counters of a reader that do not balance, a line each."""
+    """One line for each counter of a reader that does not balance."""
     parts = (counts.datagrams, *counts.skipped.values())
     return [
         *_balance("frames", counts.frames, parts),

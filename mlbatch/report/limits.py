@@ -43,7 +43,7 @@ def parse_limits(texts: Sequence[str]) -> tuple[Limit, ...]:
 
 
 def exceeded(limits: Sequence[Limit], report: RunReport) -> list[str]:
-    """What exceeds limits, a line each."""
+    """One line for each limit that is exceeded."""
     return [line for limit in limits if (line := limit.exceeded(report))]
 
 

@@ -287,7 +287,7 @@ def fill_totals(run: RunReport) -> dict[str, str]:
 
 
 def imbalances(run: RunReport) -> list[str]:
-    """Counters of a run that do not balance, a line each."""
+    """One line for each counter of a run that does not balance."""
     lines = [f"capture: {line}" for line in check_capture(run.capture)]
     ledgers = [sensor.ledger for sensor in run.sensors]
     unassigned = sum(stream.packets for stream in run.unassigned)

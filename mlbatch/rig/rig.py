@@ -60,7 +60,7 @@ class UnknownExtrinsics(NamedTuple):
 
 
 class Sweeps(NamedTuple):
-    """Files of a sensor, one a sweep, in the folder that is given as recording.
+    """Files of a sensor, one per sweep, in the folder that is given as recording.
 
     glob: pattern in the folder, and topic of the sensor; fields: name and numpy type of each field
     of a point, empty: PCD; place: file, line and key path of the pattern.

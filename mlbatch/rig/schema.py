@@ -549,7 +549,7 @@ _RATE: Key[Fraction | None] = Key(
     _rate,
     None,
     {"anyOf": [{**NUMBER, "exclusiveMinimum": 0}, text_form(r"[0-9./]+")]},
-    "scans a second: 10, 29.97, 10/3",
+    "scans per second: 10, 29.97, 10/3",
 )
 _SENSORS: Key[tuple[Node, ...]] = Key(
     "sensors",

@@ -188,7 +188,7 @@ def resolve(name: str, package: str) -> str:
 
 @lru_cache(maxsize=1)
 def _table() -> dict[str, str]:
-    """Text of each type of the table, a field a line."""
+    """Text of each type of the table, one field per line."""
     rows = (line.partition(": ") for line in _TABLE.strip().splitlines())
     return {name: fields.replace("; ", "\n") for name, _, fields in rows}
 

@@ -24,8 +24,8 @@ _HDL64 = (
     "that gen_calibration.py of velodyne_pointcloud makes of it"
 )
 _ROBOSENSE = (
-    "ROBOSENSE sends it in DIFOP packets (UDP port 7788, about one a second): record that port as "
-    "well, or give a csv of elevation,azimuth in degrees, a line for each channel"
+    "ROBOSENSE sends it in DIFOP packets (UDP port 7788, about one per second): record that port "
+    "as well, or give a csv of elevation,azimuth in degrees, a line for each channel"
 )
 # By words in the description or name of a lidar; the first that occurs.
 _ADVICE = (

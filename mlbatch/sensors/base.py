@@ -53,7 +53,7 @@ class BaseLidar:
 
     @property
     def columns_per_s(self) -> float:
-        """Columns sent in a second: one a period."""
+        """Columns sent per second: one per period."""
         return NS_PER_S / self.column_period_ns if self.column_period_ns else 0.0
 
     def _read(self, packets: U8Array, host_ns: I64Array | None = None) -> Headers:

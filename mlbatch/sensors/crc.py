@@ -3,7 +3,7 @@
 CRC-64: docs/sources/ouster.md section 2, "Packet footer": reflected polynomial 0xC96C5795D7870F42,
 start and final xor all ones. The checksum is linear: with the first eight bytes inverted, the
 register after words w0 .. wn is the xor of every word shifted over the words after it. So words are
-folded in pairs, one level of all packets a step, without a loop over bytes.
+folded in pairs, one level of all packets per step, without a loop over bytes.
 
 CRC-32: docs/sources/hesai.md section 7: polynomial 04C11DB7, start all ones, no reflection, no
 final xor. Also linear: the xor of the checksums of every byte alone, followed by zeros; a start of

@@ -56,7 +56,7 @@ def _inside(folder: Path) -> Iterator[Path]:
 def _sync_file_system(path: Path) -> bool:
     """Force the file system of `path` to the disk by one call; False if the system has none.
 
-    Every fsync flushes the cache of the disk: a call each is slow for a folder with a file a scan.
+    Every fsync flushes the cache of the disk, so a call for each of many small files is slow.
     """
     # Imported on demand: most outputs are single files.
     import ctypes

@@ -14,7 +14,7 @@ TIMES_TXT = "times.txt"
 
 
 class RowEncoder:
-    """Encodes scans as a row of float32 a point."""
+    """Encodes scans as one row of float32 per point."""
 
     def __init__(self, layout: Layout) -> None:
         self._rows = ScanRecords(layout)
@@ -25,7 +25,7 @@ class RowEncoder:
 
 
 def times_text(entries: Sequence[Entry]) -> str:
-    """Return a line a scan: its start in seconds of the common clock, with 9 decimals."""
+    """Return one line per scan: its start in seconds of the common clock, with 9 decimals."""
     return "".join(
         f"{entry.start_ns // NS_PER_S}.{entry.start_ns % NS_PER_S:09d}\n" for entry in entries
     )

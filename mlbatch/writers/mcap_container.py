@@ -40,7 +40,7 @@ from mlbatch.ros.definitions import definition, is_known, qos, qos_in_numbers
 from mlbatch.types import Message, Summary, Topic
 from mlbatch.writers.atomic import SCANS_CSV
 from mlbatch.writers.base import NO_COMPRESSION
-from mlbatch.writers.output_file import Bytes, OutputFile, borrow, joined_crc
+from mlbatch.writers.output_file import Bytes, OutputFile, joined_crc, take_scratch
 
 # Compresses so many bytes, given in parts, to one frame.
 Compress: TypeAlias = Callable[[Sequence[Bytes], int], list[Bytes]]
@@ -240,7 +240,7 @@ class McapContainer:
         """Return records as they are stored. Any thread."""
         if self._new_compress is None:
             return records
-        compress = borrow(self._idle, self._new_compress)
+        compress = take_scratch(self._idle, self._new_compress)
         stored = compress(records, size)
         self._idle.append(compress)
         return stored

@@ -34,7 +34,7 @@ from mlbatch.types import (
 from mlbatch.units import NS_PER_S
 from mlbatch.writers.atomic import SCANS_CSV, export_errors, prepare, side_path, write_text
 from mlbatch.writers.base import ScanJob, WriterOptions
-from mlbatch.writers.output_file import borrow
+from mlbatch.writers.output_file import take_scratch
 from mlbatch.writers.point_layouts import CLOUD_LAYOUTS, Layout, ScanRecords
 
 # Limits of what waits for the first scan. Samples: minutes at the rates of built-in IMUs.
@@ -209,7 +209,7 @@ class MessageWriter:
     def pack_scan(self, scan: Scan) -> tuple[CloudMessage, memoryview]:
         """Return the message of a scan and the buffer that contains it. Any thread."""
         dense = scan.info.layout != "organized"
-        cloud = borrow(self.idle, self._new_cloud)
+        cloud = take_scratch(self.idle, self._new_cloud)
         return cloud, cloud.message(scan, stamp_ns(scan), dense)
 
     def send_scan(

@@ -25,7 +25,7 @@ _DROP_BYTES = 64 << 20
 _REPEAT_BYTES = 256 << 20
 
 
-def borrow(idle: list[Scratch], new: Callable[[], Scratch]) -> Scratch:
+def take_scratch(idle: list[Scratch], new: Callable[[], Scratch]) -> Scratch:
     """Return scratch that no thread uses, or new scratch; give it back by `idle.append`."""
     # Not `if idle`: another thread may take the last one in between.
     try:

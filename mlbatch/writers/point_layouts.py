@@ -345,7 +345,7 @@ CLOUD_LAYOUTS = {
 PLY_LAYOUT = Layout("ply", 30, _PLY)
 # CloudCompare keeps properties whose name contains `scal`, and shows the rest of the name.
 _SCALARS = tuple(field._replace(name=f"scalar_{field.name}") for field in _PLY[3:])
-# small_gicp reads four floats a vertex, whatever the header says.
+# small_gicp reads four floats per vertex, whatever the header says.
 _FLOATS = (*_XYZ, _time(12))
 # By the styles of `--ply-style`.
 PLY_LAYOUTS = {

@@ -1,4 +1,4 @@
-"""Output folders with one file a scan: names, scans.csv and the move at the end."""
+"""Output folders with one file per scan: names, scans.csv and the move at the end."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ from mlbatch.writers.base import (
 from mlbatch.writers.output_file import (
     Bytes,
     WriteBehind,
-    borrow,
     drop_from_cache,
+    take_scratch,
     write_summed,
 )
 
@@ -146,7 +146,7 @@ class FolderWriter:
         written = {}
         for suffix, path in paths.items():
             idle = self._idle[suffix]
-            encoder = borrow(idle, self._encoders[suffix])
+            encoder = take_scratch(idle, self._encoders[suffix])
             with export_errors(path), path.open("wb", buffering=0) as file:
                 crc = write_summed(file, encoder.encode(scan))
                 written[path] = Written(file.tell(), crc)

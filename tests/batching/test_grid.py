@@ -54,5 +54,5 @@ def test_first_window_is_the_next_one_to_begin(t0max: int, rate: Fraction, slice
 def test_a_grid_without_windows_is_refused() -> None:
     with pytest.raises(UsageError, match=r"^rate: expected a positive number of Hz, found 0$"):
         Grid(Fraction(0))
-    with pytest.raises(UsageError, match=r"^slices: expected 1 or more a window, found 0$"):
+    with pytest.raises(UsageError, match=r"^slices: expected 1 or more per window, found 0$"):
         Grid(Fraction(10), slices=0)

@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from mlbatch.discovery import sampler
-from mlbatch.discovery.sampler import EXAMINED_AT, MOST_KINDS, Crowd, split_by_kind
+from mlbatch.discovery.sampler import EXAMINED_AT, MOST_KINDS, KindFilter, split_by_kind
 from mlbatch.discovery.types import PacketKind
 from mlbatch.types import MOST_STREAMS, OTHER_STREAMS, PacketBatch, Stream, StreamTable
 from tests.builders.captures import udp_frame, write_pcap
@@ -54,7 +54,7 @@ def test_what_is_followed_does_not_depend_on_batches(
         if stream in first or later:
             expected.add(at)
     found: set[int] = set()
-    tested = Crowd()
+    tested = KindFilter()
     with (
         patch.object(sampler, "MOST_KINDS", most),
         patch.object(sampler, "_is_recognised", is_recognised),

@@ -126,7 +126,7 @@ def test_share_of_bytes() -> None:
     assert sampler.share_of({camera}) == pytest.approx(9000 / 12000)
     assert sampler.share_of({lidar, camera}) == 1.0
     # 12000 bytes of 19 packets: 19 more have as many.
-    sampler.crowd.packets = 19
+    sampler.kind_filter.packets = 19
     assert sampler.share_of({lidar}) == pytest.approx(3000 / 24000)
 
 

@@ -18,9 +18,9 @@ from mlbatch.writers.output_file import (
     Bytes,
     OutputFile,
     WriteBehind,
-    borrow,
     file_crc,
     joined_crc,
+    take_scratch,
     write_all,
     write_summed,
 )
@@ -162,9 +162,9 @@ def test_a_joined_checksum_is_that_of_all_bytes(first: bytes, size: int, value: 
 
 def test_scratch_is_reused() -> None:
     idle = [["first"]]
-    taken = borrow(idle, list)
+    taken = take_scratch(idle, list)
     assert (taken, idle) == (["first"], [])
-    assert borrow(idle, list) == []
+    assert take_scratch(idle, list) == []
 
 
 def test_files_that_are_gone_need_no_dropping(tmp_path: Path) -> None:

@@ -135,7 +135,7 @@ class LivoxLidar(BaseLidar):
 
     @property
     def columns_per_s(self) -> float:
-        """Points sent in a second, by the first packets."""
+        """Points sent per second, by the first packets."""
         return self.columns_per_packet * self._packets_per_s
 
     def is_imu(self, size: int) -> bool:

@@ -277,7 +277,7 @@ class RobosenseLidar(BaseLidar):
 
     @property
     def columns_per_s(self) -> float:
-        """Columns sent in a second: one a round, or one for each of its returns."""
+        """Columns sent per second: one per round, or one for each of its returns."""
         return self._columns_per_round * super().columns_per_s
 
 

@@ -233,7 +233,7 @@ def difop(
 
 
 def angles_csv(angles: Angles) -> str:
-    """The vendor's file of angles: a line a channel, elevation and azimuth in degrees."""
+    """The vendor's file of angles: one line per channel, elevation and azimuth in degrees."""
     pairs = np.stack([angles.elevation_deg, angles.azimuth_deg], axis=1).tolist()
     return "".join(f"{up:.4f},{aside:.4f}\n" for up, aside in pairs)
 
@@ -314,7 +314,7 @@ def _time(spec: RobosenseSpec, time_ns: int) -> bytes:
 
 
 def _angles(angles_deg: F64Array, layout: AngleLayout, *, signed: bool) -> bytes:
-    """Three bytes a channel: sign and size, or size alone; FF where a slot has no channel."""
+    """Three bytes per channel: sign and size, or size alone; FF where a slot has no channel."""
     counts = np.rint(angles_deg / layout.unit_deg).astype(np.int64).tolist()
     if signed:
         written = [bytes((count < 0,)) + struct.pack(">H", abs(count)) for count in counts]

@@ -113,7 +113,7 @@ class SimulatedVelodyne:
         return []
 
     def _positions(self, chunk: int) -> list[Sent]:
-        """Return position packets with the time of the GPS, two a second."""
+        """Return position packets with the time of the GPS, two per second."""
         begin_ns = round(chunk * self.chunk_s * NS_PER_S)
         end_ns = round((chunk + 1) * self.chunk_s * NS_PER_S)
         after = range(-(-begin_ns // _DEVICE_NS) * _DEVICE_NS, end_ns, _DEVICE_NS)

@@ -1,4 +1,4 @@
-"""A folder of npz files, one array a key (docs/formats.md).
+"""A folder of npz files, one array per key (docs/formats.md).
 
 An npz is an uncompressed zip (PKWARE APPNOTE 6.3, sections 4.3 and 4.4) of npy files, version 1.0
 (NEP 1). `numpy.savez` would stamp files with the time of day and copy arrays; `zipfile` would write

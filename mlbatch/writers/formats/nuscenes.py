@@ -1,7 +1,7 @@
 """A folder of .pcd.bin files as in the nuScenes data set, with times and lidars of the points.
 
 Source: H. Caesar et al., "nuScenes: a multimodal dataset for autonomous driving", CVPR 2020, and
-docs/sources/outputs.md section 6. Its readers expect five float32 a point and no more: x, y, z,
+docs/sources/outputs.md section 6. Its readers expect five float32 per point and no more: x, y, z,
 intensity, ring. Time and lidar of each point are in a second file, as nuScenes has labels of
 points (lidarseg) in files of their own.
 """
