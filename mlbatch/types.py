@@ -178,7 +178,7 @@ class Recording:
     topics: tuple[Topic, ...] = field(default=(), kw_only=True)
     # Topics whose messages the batches include; set before `packets` is called.
     keep: frozenset[str] = field(default=frozenset(), kw_only=True)
-    # Those of them whose messages may be views of the batch; set before `packets` is called.
+    # Topics in `keep` whose messages may be views of the batch; set before `packets` is called.
     lend: frozenset[str] = field(default=frozenset(), kw_only=True)
     # Frames of the current pass.
     counts: CaptureCounts = field(default_factory=CaptureCounts, kw_only=True)

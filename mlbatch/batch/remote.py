@@ -229,8 +229,8 @@ def default_cache() -> Path:
 def fetched(urls: Sequence[str], cache: Path, user: object) -> Iterator[dict[str, str]]:
     """Paths of local copies of files, by URL; calibrations lie next to them. Removed at the end.
 
-    user: what they are for, of which there is one at a time. Those of an interrupted run stay for
-    the next one; other versions of the files have another folder.
+    user: what the copies are for; only one process uses them at a time. Copies of an interrupted
+    run stay for the next one. Other versions of the files have another folder.
     """
     files = with_calibrations(urls)
     folder = cache / "inputs" / digest_of(user, *files)
@@ -264,7 +264,7 @@ def digest_of(*values: object) -> str:
 
 
 def _copy_in(folder: Path, url: str) -> Path:
-    """Where a copy lies: those of one folder, and no others, next to each other."""
+    """Return the path of a copy; copies are in one folder if and only if their files are."""
     parent, _, name = url.rpartition("/")
     return folder / digest_of(parent) / name
 

@@ -76,7 +76,7 @@ def _fill(count: int, expected: float) -> float:
 
 @dataclass(slots=True)
 class _Expectation:
-    """What is expected of one sensor, as far as known."""
+    """Columns expected of one sensor, as far as known."""
 
     pace: Pace
     # (SECTORS,) bool: in which the sensor had a column.
@@ -85,7 +85,7 @@ class _Expectation:
     _revolution_ns: float = 0.0
     # False once all is known: at once, or after a revolution, except with dark sectors.
     learns: bool = field(init=False)
-    # `columns` by length of the window, of which there are two at most: its bounds are rounded.
+    # `columns` by length of the window. Bounds are rounded, so there are at most two lengths.
     _columns: dict[int, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:

@@ -1,8 +1,8 @@
 """Frame-level fusion: the sweeps of all sensors, joined to sets by a policy of `sweeps`.
 
 What drivers and message filters would give (approach A of the paper), from the same columns as
-windows. A set is a `Window` that is on no grid. Sweeps of which all sets are known are forgotten:
-their columns were used, or are counted.
+windows. A set is a `Window` that is on no grid. A sweep is released once all its sets are known:
+its columns were used, or are counted.
 """
 
 from __future__ import annotations

@@ -23,7 +23,7 @@ class PacketLoss:
     """Lost and reordered packets of one sensor.
 
     Zero for a sensor that has neither sequence numbers nor a known packet period. numbers, gaps:
-    those that count; the intake counts numbers itself.
+    the counters in use; the intake counts numbers itself.
     """
 
     def __init__(self, modulus: int, packet_ns: float = 0.0) -> None:
@@ -131,7 +131,7 @@ class _Packets:
         )
 
     def mirrored(self) -> _Packets:
-        """The same packets of a rotor that turns the other way."""
+        """The same packets with the rotor direction reversed."""
         return _Packets(self.stamp_ns, self.host_ns, -self.first, -self.last, ~self.bins)
 
 
@@ -209,7 +209,7 @@ class GapLoss:
         self._waiting += len(packets)
         if self._waiting >= self._limit:
             self._evaluate()
-            # A share of those that wait: else the cost would grow with the square of their number.
+            # Grows with the waiting packets: with a constant limit time is their number squared.
             self._limit = max(3 * _CHUNK, self._waiting + max(_CHUNK, self._waiting // 4))
 
     def _evaluate(self) -> None:

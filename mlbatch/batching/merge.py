@@ -12,7 +12,7 @@ from mlbatch.types import ColumnFigures, Columns, WindowColumns, WindowFigures
 
 _NONE = np.empty(0, np.int64)
 _FIGURES = 7
-# Of a sensor; more, as of packets that come one by one, cost less when they are joined first.
+# Parts of a sensor's columns. More parts, as of packets that come one by one, are joined first.
 _MOST_PARTS = 3
 
 
@@ -35,7 +35,7 @@ class ColumnMerge:
                 own[:] = [joined(own)]
         merged = self._taken(waiting, until)
         if merged is None:
-            # Those of a sensor are not in order: by stamp, equal ones by delivery.
+            # Columns of a sensor are not in order: sort by stamp, equal ones by delivery.
             for own in waiting:
                 columns = joined(own)
                 own[:] = [columns.take(columns.stamp_ns.argsort(kind="stable"))]

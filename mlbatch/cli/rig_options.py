@@ -12,7 +12,7 @@ _SECTION = b"convert"
 
 
 def take(context: Any, params: Sequence[Any]) -> Mapping[str, str]:
-    """Set options that the command line leaves out to those of the rig; their places by name."""
+    """Set options from the rig unless the command line gives them; return their places by name."""
     given = context.params.get("rig")
     rig = Path(given or "")
     if given is None or not _may_have_section(rig):

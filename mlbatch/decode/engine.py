@@ -99,7 +99,7 @@ class Engine:
 
     @property
     def totals(self) -> PackedTotals | None:
-        """Those of the points of the last call; None without."""
+        """Totals of the points of the last call; None if records are not packed."""
         return None if self._packer is None else self._packer.totals
 
     def decode(

@@ -57,7 +57,7 @@ class RecordPacker:
 
     @property
     def totals(self) -> PackedTotals | None:
-        """Those of the points since `start`; None if the layout has none."""
+        """Totals of the points since `start`; None if the layout has none."""
         if "las" not in self.kinds:
             return None
         low, high = self._totals.low, self._totals.high

@@ -495,7 +495,7 @@ def _radians(sensors: Sequence[DetectedSensor]) -> Iterator[Note]:
 
 
 def _is_round_in_radians(angle: float) -> bool:
-    """True for a multiple of pi / 4 to all digits given, of which there are two or more."""
+    """True for a multiple of pi / 4 to all decimals given, at least two."""
     exponent = Decimal(repr(angle)).as_tuple().exponent
     if not isinstance(exponent, int) or exponent > -2:
         return False

@@ -42,8 +42,9 @@ _NEAR_NS = NS_PER_S
 _FIRST_BYTES = 8 << 20
 # Instants of a lidar that are kept of each recording.
 _MOST_INSTANTS = 4096
-# Least number of instants with other packets, and least share of those that both recordings have: a
-# packet may be damaged. After so many of which most agree, the recordings are copies.
+# Recordings contradict each other from this number of shared instants with other packets on, and
+# this share of all shared instants: a packet may be damaged. After `_SETTLED` shared instants that
+# mostly agree, the recordings are copies.
 _MIN_OTHERS = 3
 _OTHERS = 0.5
 _SETTLED = 200

@@ -106,7 +106,7 @@ def _may_be_installed(group: str) -> bool:
     """False if no distribution on the path has entry points of a group.
 
     Their files are searched for its name, in a twentieth of the time that `importlib.metadata`
-    takes. True if something on the path is not a folder, or is searched by an own finder.
+    takes. True if something on the path is not a folder, or has a finder of its own.
     """
     finders = (finder for finder in sys.meta_path if hasattr(finder, "find_distributions"))
     if any(finder is not PathFinder for finder in finders):

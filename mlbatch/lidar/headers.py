@@ -200,7 +200,7 @@ def fields_of(table: type) -> list[tuple[str, type[Any]]]:
 
 
 class Headers(NamedTuple):
-    """Headers of packets (P,); those of packets that are not the sensor's and good are any."""
+    """Headers of packets (P,); undefined where a packet is not the sensor's or has a fault."""
 
     is_mine: BoolArray
     faults: U8Array  # indices into FAULTS
@@ -282,7 +282,7 @@ class HeaderReader:
             raise IndexError("packets outside of their array")
 
     def read_rows(self, packets: U8Array, host_ns: I64Array | None = None) -> Headers:
-        """Read packets (P, size or more), received at host_ns (P,), None: any time."""
+        """Read packets (P, size or more) received at host_ns (P,); None: at any time."""
         rows = np.ascontiguousarray(packets[:, : self._size])
         start = np.arange(len(rows)) * self._size
         times_ns = np.zeros(len(rows), np.int64) if host_ns is None else host_ns

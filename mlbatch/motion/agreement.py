@@ -35,7 +35,7 @@ _KEPT_SHARE = 0.9
 # Delays that are tried.
 _FARTHEST_NS = NS_PER_S
 _STEP_NS = 5 * NS_PER_MS
-# What a good rig may have; delays of filters and interfaces are several ms. A few windows of a
+# Tolerances of a good rig; delays of filters and interfaces are several ms. A few windows of a
 # steady turn do not give the delay: of simulated drives 0.2 % with 12 to 16 windows were 30 ms off.
 _SCALE = 0.15
 _TURNED_DEG = 10.0

@@ -25,7 +25,7 @@ _NOTHING = 1e-9
 class PoseLine:
     """Poses of the body in order of time; new ones are added at the end.
 
-    track: those that are kept; poses: how many were added.
+    track: poses that are kept; poses: number that were added.
     """
 
     def __init__(self, track: PoseTrack) -> None:

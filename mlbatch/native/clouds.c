@@ -238,8 +238,8 @@ EXPORT int64_t mlbatch_cloud_columns(int64_t count, const int64_t *stamp_ns, con
     return base + layers;
 }
 
-/* Write the points to packets of `size` bytes, all zero but their heads: `HEAD` of
-   point_packets.py, of which stamps, numbers and counts are written here.
+/* Write the points to packets of `size` bytes, all zero but their heads (`HEAD` of
+   point_packets.py). Stamps, numbers and counts in the heads are written here.
 
    column, slot (count,): of the points, in `order` (NULL: their own). used (columns,): zeros.
    ring, return_type, tag: NULL: zeros. */

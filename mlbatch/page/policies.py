@@ -20,7 +20,7 @@ class PolicyFigures:
 
     start_s: of a set, from the first of all policies; span_ms: from its first to its last column;
     apart_ms: between the mean times of its sensors; latency_ms: from its first column until it is
-    complete; columns: those that could be used.
+    complete; columns: number that could be used.
     """
 
     name: str

@@ -34,7 +34,7 @@ from mlbatch.types import ImuSamples, Message, Topic, instant_ns
 from mlbatch.units import NS_PER_MS, NS_PER_S
 
 IMU = "imu"
-# What sets of sweeps may begin before the newest window, with room.
+# Poses kept before the newest window; sets of sweeps begin less than this before it.
 _KEPT_NS = 5 * NS_PER_S
 # An IMU gives no pose before its first second is complete.
 _LEAST_WAIT_NS = 2 * NS_PER_S

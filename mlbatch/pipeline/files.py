@@ -278,8 +278,8 @@ class Files:
         self.scans = 0 if self._earlier is None else self._earlier.scans
         self.run: Conversion | None = None
         self._journal: io.FileIO | None = None
-        # What the scans are made from that are not in the journal, as taken; then those of files
-        # that are not whole.
+        # Content keys of the scans that are not yet in the journal, in order; then the scans of
+        # files that are not whole.
         self._contents: deque[int] = deque()
         self._unfinished: dict[Unit, list[FinishedScan]] = {}
 

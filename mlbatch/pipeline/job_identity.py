@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 _NOT_IDENTITY = frozenset(
     {"recordings", "selection", "segment", "extras", "record", "fault_begin_ns", "jobs"}
 )
-# What decoding takes from a calibration, apart from `beams`; see `Lidar`.
+# Fields of a `Lidar` that decoding uses, apart from `beams`.
 _CALIBRATED = (
     "model",
     "mode",

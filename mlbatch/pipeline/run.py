@@ -117,7 +117,7 @@ class _Output:
         """The task of a scan with the messages before it; many messages are tasks of their own."""
         task = None if isinstance(item, SkippedWindow) else item
         before: Sequence[ImuSamples | Message] = ()
-        # What is only counted need not be cut at every window.
+        # A dry run only counts messages, so it need not cut them at every window.
         if self._open_writer is not None or item.end_ns >= self._passed_ns + _DRY_NS:
             self._passed_ns = item.end_ns
             before = self._run.passed_through(item.end_ns, _PORTION_BYTES)

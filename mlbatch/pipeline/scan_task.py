@@ -32,8 +32,8 @@ class ScanTask:
     ) -> None:
         """task: None where messages are to be written without a scan; before: what to write first.
 
-        writer: None in a dry run; idle: decode workers, of which one is taken while in use;
-        files: those of the output, None in a dry run; kept: the scan, if it is in a file of another
+        writer: None in a dry run; idle: decode workers not in use;
+        files: of the output, None in a dry run; kept: the scan, if it is in a file of another
         run; index: of its window, None where no scan follows the messages.
         """
         self._run = run

@@ -139,7 +139,7 @@ class _Feed:
             first_ns = int(first.host_ns[0])
             known_until_ns = first_ns if begin_ns is None else min(first_ns, begin_ns)
         else:
-            # Log times of messages are no clock for the packets of others unless `by_log_time`.
+            # Log times of messages order packets of other recordings only with `by_log_time`.
             known_until_ns = first.messages[0].host_ns if by_log_time else 0
         return cls(recording, by_log_time, known_until_ns)
 

@@ -152,9 +152,9 @@ class Source:
 class Window:
     """A reused buffer that slides over a source.
 
-    Bytes `data[begin:end]` are those of the (decompressed) file from `place` on; the first `front`
-    bytes of `data` are free for other use, and SLACK bytes follow `end`. `begin` may be moved
-    behind `end`: `refill` then skips the bytes between.
+    `data[begin:end]` are the bytes of the (decompressed) file from offset `place` on. The first
+    `front` bytes of `data` are free for other use, and SLACK bytes follow `end`. `begin` may be
+    moved behind `end`: `refill` then skips the bytes between.
     """
 
     def __init__(

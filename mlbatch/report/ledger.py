@@ -13,7 +13,7 @@ from mlbatch.types import CaptureCounts
 CAPTURE_REASONS = ("not_ip", "not_udp", "truncated", "fragment", "fragment_lost", "no_stream")
 PACKET_REASONS = ("bad_size", "bad_header", "bad_crc", "bad_stamp", "duplicate")
 # `incomplete`: of windows left out by --drop-incomplete. Of frame-level fusion: `part_sweep`: of
-# sweeps of which the recording has a part only; `no_set`: of sweeps that no set contains.
+# sweeps that the recording contains in part; `no_set`: of sweeps that no set contains.
 # `no_pose`: of windows that --deskew left out.
 COLUMN_REASONS = (
     "before_start",

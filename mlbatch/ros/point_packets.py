@@ -1,4 +1,4 @@
-"""An own packet format for points of decoded clouds: one column per packet.
+"""mlbatch's own packet format for points of decoded clouds: one column per packet.
 
 Points that share a timestamp are a column. A packet contains one column, so that none is padded
 with columns that nobody measured, and every column is counted. Layout, little endian (version 1): a

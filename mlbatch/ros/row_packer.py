@@ -40,7 +40,7 @@ Room: TypeAlias = Callable[[int, int], U8Array]
 
 
 class PackedRows(NamedTuple):
-    """Packets (P, size) of a message; placed: rows with a place; points: those with a time, too.
+    """Packets (P, size) of a message; placed: rows with a place; points: placed rows with a time.
 
     content_key: (P,) as `lidar.headers.content_keys`, None without factors.
     """

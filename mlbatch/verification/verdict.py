@@ -43,7 +43,7 @@ class Check:
     name: str
     # Number of values that were checked.
     checked: int
-    # Their number, also of those that are not kept.
+    # Number of violations, including those that are not kept.
     violations: int
     # Reason why nothing, or only a part, is checkable in this output.
     limit: str

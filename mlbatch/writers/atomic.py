@@ -37,7 +37,7 @@ _SCAN_FILE = r"(\d{6,}|head)(-\d+)?\.([\w.]+)"
 # Names that only mlbatch gives, or that its first versions wrote without a scans.csv.
 _UNMARKED = ("npz", "ply")
 # The same for a ROS 2 bag, lists of times and of files. Other programs write such files too, and
-# scans of other formats: scans.csv marks an own output.
+# scans of other formats: scans.csv marks an output of mlbatch.
 _SHARED_FILE = r".+_\d+\.mcap|metadata\.yaml|times\.txt|files\.jsonl"
 # A report may have any name (`--report`); it is recognised by its first bytes, in any version.
 _REPORT = rb'\{\s*"schema":\s*"mlbatch\.report/'

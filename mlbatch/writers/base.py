@@ -27,7 +27,7 @@ class WriterOptions(NamedTuple):
     ply_style: str = "standard"  # names and types of PLY properties
     fsync: bool = True  # force the output to the disk before it gets its name
     max_bag_s: float = 0.0  # recorded time in a file of a ROS 2 bag, s; 0: all in one file
-    files: FileSet | None = None  # those that this run is to make; None: all
+    files: FileSet | None = None  # the files that this run is to make; None: all
 
 
 class FileSet(Protocol):

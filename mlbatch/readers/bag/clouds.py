@@ -1,4 +1,4 @@
-"""The trick for decoded clouds: their points are re-packed as packets of an own format.
+"""The trick for decoded clouds: their points are re-packed as packets of mlbatch's own format.
 
 The rest of the pipeline then batches them like raw packets: each packet is one column, i.e. points
 that share a timestamp (`ros.point_packets`), of one size per topic, received at the log time of its

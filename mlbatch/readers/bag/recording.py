@@ -195,7 +195,7 @@ class _Unpacking:
     def _corrections(
         self, topic: Topic, found: PacketsFound, rows: I64Array, log_ns: I64Array
     ) -> list[tuple[int, Message]]:
-        """Calibrations among the packets, as messages of an own type."""
+        """Return calibrations among the packets as messages of `CORRECTION_TYPE`."""
         if topic.name not in self._recording.keep:
             return []
         own = Topic(topic.name, CORRECTION_TYPE, "bytes")

@@ -6,7 +6,7 @@ from mlbatch.arrays import U8Array
 
 # Position packets, data packets, look-alikes.
 _SIZES = (512, 1206, 1212)
-# Keys of the YAML and of db.xml, at least one of which a file has.
+# Keys of the YAML and of db.xml; a file has at least one.
 _KEYS = (
     *(b"laser_id", b"vert_correction", b"distance_resolution"),
     *(b"rotCorrection_", b"vertCorrection_", b"distLSB_"),

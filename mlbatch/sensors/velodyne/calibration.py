@@ -244,7 +244,7 @@ def _file(
 ) -> VelodyneFile:
     """Corrections of enabled lasers in the order of laser ids.
 
-    Files of 16 and 32 lasers may list 64 of which only the first are enabled.
+    Files of 16 and 32 lasers may list 64, with only the first ones enabled.
     """
     by_id = _by_id(path, form, entries)
     used = int(np.flatnonzero(enabled)[-1]) + 1

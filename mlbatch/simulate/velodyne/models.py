@@ -55,7 +55,7 @@ def _plain(
     vertical_mm: Sequence[float],
     azimuth_deg: Sequence[float] = (),
 ) -> Table:
-    """A model of which a table says all."""
+    """A model that a table describes completely."""
     nothing = (0.0,) * len(elevation_deg)
     return Table(
         product=product,

@@ -120,7 +120,7 @@ class _Rosbag1File:
             self._forget_places()
 
     def _forget_places(self) -> None:
-        """Replace the times and places of messages in written chunks, of which the number is used.
+        """Replace the times and offsets of messages in written chunks: only their number is used.
 
         The library keeps all of them to the end.
         """

@@ -1,4 +1,4 @@
-"""Very many packet kinds: which are followed, and what of a lidar among them is found."""
+"""Very many packet kinds: which are followed, and whether a lidar among them is found."""
 
 from __future__ import annotations
 
