@@ -88,7 +88,7 @@ def read(output: AnyPath) -> Iterator[Scan]:
 
 
 def inspect(recordings: Paths, metadata: Paths = (), *, whole: bool = False) -> Inspection:
-    """What the first 10 s of recordings contain (whole: all of them), as `mlbatch inspect`."""
+    """Inspect the first 10 s of recordings (whole: all of them), as `mlbatch inspect` does."""
     paths = paths_of("recording", recordings)
     if not paths:
         raise UsageError("recording: expected at least one path, found none; name a recording")

@@ -37,7 +37,7 @@ class Stream(NamedTuple):
 
     @property
     def names(self) -> frozenset[str]:
-        """What `--only` and `--ignore` accept for it."""
+        """Names that `--only` and `--ignore` accept for it."""
         if self.topic:
             return frozenset({str(self), self.topic})
         address = f"[{self.source_ip}]" if ":" in self.source_ip else self.source_ip
@@ -405,7 +405,7 @@ class RecordLayout(NamedTuple):
 
 
 class PackedTotals(NamedTuple):
-    """What a header says of the points of a scan."""
+    """Totals over the points of a scan, for a header."""
 
     low_m: tuple[float, ...]  # x, y, z; above `high_m` without points
     high_m: tuple[float, ...]

@@ -132,7 +132,7 @@ def _earlier(task: Task) -> SessionRecord | None:
 
 
 def _outcome(task: Task, run: Callable[[], SessionRecord]) -> Outcome:
-    """How a session ended; one that could not be run must not end the others."""
+    """Outcome of a session; a session that could not run must not end the others."""
     name = task.session.name
     try:
         return SessionStatus(name, run())
@@ -143,7 +143,7 @@ def _outcome(task: Task, run: Callable[[], SessionRecord]) -> Outcome:
         if isinstance(err, OSError):
             err = system_error(err)
         line = str(err) if isinstance(err, MlbatchError) else f"{type(err).__name__}: {err}"
-        # It is not in the folder of the session.
+        # The session's folder has no record of this.
         record = SessionRecord(name, FAILED, 1, line, {}, inputs=[*task.session.inputs])
         return SessionStatus(name, record)
 

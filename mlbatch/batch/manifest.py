@@ -36,7 +36,7 @@ _OPTIONS = {one.name: one for one in options.BATCH} | {
 
 @dataclass(frozen=True, slots=True)
 class Common:
-    """What all sessions share, unless they have their own.
+    """Values for all sessions that have none of their own.
 
     rig: may have fields as names of sessions; rig_place: key of the manifest, "" of the command
     line, which reads it itself.

@@ -1,4 +1,4 @@
-"""What a batch would do: sessions, bytes and time, from earlier sessions of the same output."""
+"""Plan of a batch: sessions, bytes and time, from earlier sessions of the same output."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class PlannedSession:
 
 @dataclass(frozen=True, slots=True)
 class Plan:
-    """Sessions and estimates for those that would run."""
+    """Sessions of a batch, with estimates for the sessions that would run."""
 
     sessions: tuple[PlannedSession, ...]
     ratio: float  # bytes of output for a byte of input

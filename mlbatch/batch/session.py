@@ -22,7 +22,7 @@ PAGE_HTML = "page.html"
 OUTPUT = "scans"
 # Output formats that are one file; others are folders.
 _SUFFIX = {"mcap": ".mcap", "rosbag1": ".bag"}
-# What a run writes to the folder of its session, with `--on-jump split` for each segment.
+# Files that a run writes to the folder of its session, with `--on-jump split` for each segment.
 OWN = re.compile(
     r"scans(\.seg\d+)?(\.mcap|\.bag)?(\.scans\.csv)?(\.partial)?(\.state|\.old)?"
     r"|(report|page)(\.seg\d+)?\.(json|html)(\.partial)?|log\.txt"
@@ -133,7 +133,7 @@ def read_rig(rig: str | None) -> Rig | None:
 
 
 def own_files(folder: Path) -> list[Path]:
-    """What a run wrote to the folder of a session."""
+    """Files that a run wrote to the folder of a session."""
     if not folder.is_dir():
         return []
     return sorted(path for path in folder.iterdir() if OWN.fullmatch(path.name))

@@ -72,7 +72,7 @@ class SessionStatus:
 
     @property
     def row(self) -> tuple[str, ...]:
-        """What a table shows, below `HEAD`."""
+        """Cells of a table row, in the order of `HEAD`."""
         record = self.record
         if record is None:
             return (self.name, self.word, *[""] * (len(HEAD) - 2))

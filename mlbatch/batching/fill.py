@@ -68,7 +68,7 @@ class FillMeter:
 def _fill(count: int, expected: float) -> float:
     """The fill; expected: NaN if the rate of the sensor is unknown."""
     if math.isnan(expected):
-        # Whatever the rate is, there should be columns.
+        # The rate is unknown, but there should be columns.
         return UNKNOWN if count else 0.0
     whole = math.floor(expected * (1 + _ROUNDING))
     return UNKNOWN if whole < LEAST_EXPECTED else min(1.0, count / whole)

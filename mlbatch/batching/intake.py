@@ -287,5 +287,5 @@ class Intake:
 
 
 def remedies(has_receive_times: bool) -> str:
-    """What to do about a clock that jumps; has_receive_times: as in `Intake`."""
+    """Policy for a clock that jumps; has_receive_times: as in `Intake`."""
     return "use --on-jump split" + (", or --clock host" if has_receive_times else "")

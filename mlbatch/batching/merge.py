@@ -45,7 +45,7 @@ class ColumnMerge:
         return merged
 
     def _taken(self, waiting: Sequence[list[Columns]], until: int) -> WindowColumns | None:
-        """As `take_until`; None, and nothing taken, if the columns of a sensor are not in order."""
+        """Do `take_until`; return None and take nothing if a sensor's columns are not in order."""
         parts = [(sensor, one) for sensor, own in enumerate(waiting) for one in own]
         structs = (Part * len(parts))()
         kept = []

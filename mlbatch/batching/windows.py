@@ -62,7 +62,7 @@ class Window:
 
 
 class Schedule:
-    """Which windows of the grid a run writes. Arguments named `window` are slice numbers q."""
+    """Selects the windows that a run writes. Arguments named `window` are slice numbers q."""
 
     def __init__(self, grid: Grid, policy: Policy) -> None:
         self.t_init_ns: int | None = None

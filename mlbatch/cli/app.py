@@ -24,7 +24,7 @@ COMMANDS = (
 
 HELP = ("-h", "--help")
 
-# What may be `-`, standard output or, as a source, standard input: command and parameter.
+# Parameters that may be `-` (standard output or, as a source, standard input), by command.
 PRINTABLE = frozenset(
     {
         *(("convert", "report"), ("inspect", "write_rig")),

@@ -18,7 +18,7 @@ from mlbatch.cli import main
 def _end_with_parent() -> None:
     while os.read(0, 1):
         pass
-    # What is finished is safe: `--resume` continues after it.
+    # Finished files are safe: `--resume` continues after it.
     os.kill(os.getpid(), signal.SIGKILL)
 
 

@@ -112,7 +112,7 @@ def _print_summary(
 
 
 def _beyond_limits_before(target: Target, name: str) -> list[str]:
-    """What exceeds limits in the output that an earlier run completed; name: of the format."""
+    """One line per exceeded limit in the output of an earlier run; name: of the format."""
     if not target.limits or target.request.output is None:
         return []
     from mlbatch.report.limits import exceeded

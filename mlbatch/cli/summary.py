@@ -1,4 +1,4 @@
-"""What commands that make an output print in the end: lines to stderr, and the summary."""
+"""Final lines and summary of commands that make an output."""
 
 from __future__ import annotations
 

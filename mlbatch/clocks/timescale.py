@@ -1,4 +1,4 @@
-"""What the stamps of a sensor count: UTC, TAI, GPS time, time since power-on; leap seconds.
+"""Timescale of a sensor's stamps: UTC, TAI, GPS time, time since power-on; leap seconds.
 
 The timescale follows from the values of the stamps and the receive times of their packets, never
 from a mode field: a sensor in PTP mode counts from power-on until PTP locks
@@ -209,7 +209,7 @@ def format_difference(value_ns: int) -> str:
 # one sensor changed.
 HOST = "host"
 DELAY = "delay"
-# What stepped between two packets: stamps (`sensor`) or receive times (HOST).
+# The clock that stepped between two packets: of stamps (`sensor`) or receive times (HOST).
 SENSOR = "sensor"
 # A sensor sends within seconds of power-on, when its clock starts.
 _STARTED_NS = 600 * NS_PER_S

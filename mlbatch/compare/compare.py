@@ -96,7 +96,7 @@ class Comparison:
         return f"{self.compared_s:.1f} s of {sensors}; windows at {self.rate_hz} Hz; times in ms"
 
     def figures(self) -> list[PolicyFigures]:
-        """What pages and figures show of each policy."""
+        """Figures of each policy, for pages and plots."""
         starts_ns = [one.series.first_ns for one in self.reports if one.series is not None]
         begin_ns = min((int(start.min()) for start in starts_ns if len(start)), default=0)
         return [
@@ -228,7 +228,7 @@ def _run(
             ready_ns = previous.end_ns + SLACK_NS
             statistics.add(_sweeps_of(previous, len(run.sensors)), ready_ns)
             columns += len(previous.columns)
-        # As in a conversion, the head and the window of the last timestamp are not counted.
+        # Like `convert`: the head and the window of the last timestamp are not counted.
         previous = window if window.index >= 0 else None
     run.session.refuse_absent()
     if not columns or first_ns is None:

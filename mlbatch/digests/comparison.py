@@ -13,7 +13,7 @@ Json: TypeAlias = "dict[str, Json] | list[Json] | str | int | float | bool | Non
 _POSE = "body_from_sensor"
 _POSE_TOLERANCE = 1e-9
 _NOTHING = "nothing"
-# What made a golden file is not compared.
+# The program that made a golden file is not compared.
 _ORIGIN = ("schema", "version")
 
 

@@ -19,7 +19,7 @@ from mlbatch.outputs.scan import Scan
 
 
 class _Key(NamedTuple):
-    """What scans of two outputs have in common."""
+    """Window and sensor, by which scans of two outputs are matched."""
 
     window: tuple[int, int]  # index, slice
     sensor: str
@@ -41,7 +41,7 @@ class FieldDifference:
 
 @dataclass(slots=True)
 class OutputDiff:
-    """What differs between two outputs."""
+    """Differences between two outputs."""
 
     compared: int = 0  # scans in both
     run: list[Difference] = field(default_factory=list)  # grid, accounts, warnings

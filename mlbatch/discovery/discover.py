@@ -56,7 +56,7 @@ _NO_SUPPORTED = "expected a supported lidar, found none; see `mlbatch sensors` f
 
 @dataclass(frozen=True, slots=True)
 class SensorSelection:
-    """Which sensors to convert, and what is known of them: options of the command line."""
+    """Options of the command line that select sensors, or state facts about them."""
 
     rig: Path | None = None
     metadata: tuple[Path, ...] = ()
@@ -69,7 +69,7 @@ class SensorSelection:
 
 
 class Ignored(NamedTuple):
-    """What the user left out by --only and --ignore: sensors, and addresses or serial numbers."""
+    """Sensors, addresses and serial numbers that the user left out by --only and --ignore."""
 
     sensors: tuple[DetectedSensor, ...] = ()
     words: tuple[str, ...] = ()
@@ -134,7 +134,7 @@ class Discovery:
 
     @property
     def recordings(self) -> Sequence[Recording]:
-        """What to read: decoded clouds are packets."""
+        """Recordings to read, with decoded clouds as packets."""
         return self.first.recordings
 
     def frames(self) -> dict[str, F64Array]:
@@ -434,7 +434,7 @@ def _names(examined: Sequence[Path], recorded: Sequence[Calibration]) -> list[st
 
 
 class Refusal(NamedTuple):
-    """What is said of lidar packets without a sensor: of some among others, and where all are."""
+    """Messages about lidar packets without a sensor: if some have none, and if all have none."""
 
     code: str
     among_others: str

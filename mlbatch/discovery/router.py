@@ -18,7 +18,7 @@ from mlbatch.types import Stream, StreamTable
 
 
 class Role(Enum):
-    """What the packets of a kind are."""
+    """Use of the packets of a kind."""
 
     LIDAR = "lidar"
     IMU = "imu"

@@ -222,7 +222,7 @@ class Sampler:
     def numbered_samples(
         self, kind: PacketKind, lidar: Lidar
     ) -> tuple[U8Array, I64Array, I64Array]:
-        """As `good_samples`, and the numbers of the packets among all of the kind (k,)."""
+        """Return `good_samples`, and the position of each packet among all of its kind (k,)."""
         samples = self.kinds[kind]
         packets, host_ns = samples.arrays()
         packets = packets[:, : lidar.packet_size]

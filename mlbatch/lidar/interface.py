@@ -235,7 +235,7 @@ class Lidar(Protocol):
     clock_period_ns: int
     # Source of the calibration, for people.
     calibration: str
-    # What of the calibration packets cannot confirm, or "": for information, no warning.
+    # Part of the calibration that packets cannot confirm, or "": for information, no warning.
     unproven: str
     notes: tuple[str, ...]
 

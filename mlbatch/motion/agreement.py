@@ -104,7 +104,7 @@ class _Fit:
     delay_ns: int = 0
 
     def fault(self, windows: int) -> str:
-        """What is beyond the tolerance: "all" for more than one."""
+        """Name of the quantity beyond its tolerance; "all" for more than one."""
         most_ns = _DELAY_NS if windows >= _MANY_WINDOWS else _DELAY_OF_FEW_NS
         faults = (
             *(["scale"] if abs(math.log(self.scale)) > math.log(1.0 + _SCALE) else ()),

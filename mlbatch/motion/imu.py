@@ -37,7 +37,7 @@ _LEAST_GAP_NS = 20 * NS_PER_MS
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Standstill:
-    """What the IMU measured at rest, IMU frame; period_ns: between samples.
+    """Means of the IMU at rest, in the IMU frame; period_ns: between samples.
 
     gyro_bias: (3,), rad/s; gravity: (3,), m/s2, upward.
     """

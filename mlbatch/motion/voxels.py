@@ -139,7 +139,7 @@ class LocalMap:
     def _shapes(
         self, key: I64Array, mean_m: F64Array, variance: F64Array, direction: F64Array
     ) -> tuple[BoolArray, BoolArray]:
-        """Which of k voxels are planes, and which stems.
+        """Masks of k voxels: planes, and stems.
 
         variance: (k, 3), increasing, m2; direction: (k, 3, 3), their directions as columns.
         """
@@ -155,7 +155,7 @@ class LocalMap:
         return is_plane, is_stem
 
     def _continues(self, key: I64Array, mean_m: F64Array, normal: F64Array) -> BoolArray:
-        """Which of k planes have a neighbour on the same plane."""
+        """Mask of k planes: those with a neighbour on the same plane."""
         found = np.zeros(len(key), np.bool_)
         most_m = _FLUSH * self.edge_m
         for step in _NEIGHBOURS if len(key) else ():
@@ -171,7 +171,7 @@ class LocalMap:
 
 
 def _has_neighbour(key: I64Array, others: I64Array) -> BoolArray:
-    """Which voxels (k,) have one of the others, increasing, on a side of the same height."""
+    """Mask (k,): voxels with a horizontal neighbour among the others, which are increasing."""
     found = np.zeros(len(key), np.bool_)
     for step in _LEVEL_NEIGHBOURS if len(others) else ():
         at = np.minimum(others.searchsorted(key + step), len(others) - 1)

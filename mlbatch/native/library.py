@@ -189,7 +189,7 @@ class Scan(ctypes.Structure):
 
 
 class Totals(ctypes.Structure):
-    """What a header of LAS says of all points."""
+    """Totals of all points in a LAS header."""
 
     _fields_: ClassVar = [
         ("low", ctypes.c_float * 4),
@@ -324,7 +324,7 @@ class Accepted(ctypes.Structure):
 
 
 class Dissection(ctypes.Structure):
-    """What is known of a capture from frame to frame."""
+    """State of reading a capture, kept from frame to frame."""
 
     _fields_: ClassVar = [
         ("room", _WORD),

@@ -1,4 +1,4 @@
-"""What all containers share: messages, and reads that libraries cannot stretch.
+"""Shared by all containers: messages, and reads of bounded length.
 
 `mcap`, `rosbags` and `zipfile` parse the records. The lengths of records are checked against the
 file, and sizes of compressed data against a limit, before a library allocates anything.

@@ -1,4 +1,4 @@
-"""What the readers of outputs find damaged: a log that `verify` listens to.
+"""Damage that readers of outputs find: a log that `verify` listens to.
 
 A reader gives what it can read, and notes what is not as it should be under the name of a check.
 """

@@ -14,7 +14,7 @@ from mlbatch.outputs.metadata import RunMetadata
 from mlbatch.outputs.stored_scan import StoredScan
 
 _NAME = re.compile(r"(?:(\d{6,})|(head))(?:-(\d+))?", re.ASCII)
-# What a shard has instead of a report.
+# File of a shard instead of a report.
 _SHARD = "shard.json"
 # Files with other suffixes are ignored.
 _FIRST, _SECOND = ".pcd.bin", ".time.bin"

@@ -305,7 +305,7 @@ class _Run:
         )
 
     def _info_of(self, frame_id: str, organized: bool) -> RunInfo:
-        """What all scans share, made once."""
+        """The description that all scans share, made once."""
         key = (frame_id, organized)
         if key not in self._infos:
             layout = "organized" if organized else "dense"

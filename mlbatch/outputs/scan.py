@@ -38,7 +38,7 @@ _POINT_ARRAYS = (
     "return_type",
     "lidar_id",
 )
-# What scans of conversions do not have.
+# Fields that scans of conversions do not have.
 _OF_OUTPUTS = ("absent", "sensor")
 # Arrays from which the fields of a point layout are made; the others are made of `xyz`.
 _NEEDED = {
@@ -110,7 +110,7 @@ class Scan:
 
     @property
     def point_count(self) -> int:
-        """Number of points; empty slots of an organized scan are none."""
+        """Number of points, without the empty slots of an organized scan."""
         return int(np.count_nonzero(self.is_valid))
 
     @property
@@ -157,7 +157,7 @@ class Scan:
 
     @property
     def is_valid(self) -> BoolArray:
-        """Which places contain a point: all of a dense scan, some slots of an organized one."""
+        """True where there is a point: in all of a dense scan, in slots of an organized one."""
         valid: BoolArray = np.isfinite(self.xyz[..., 0])
         return valid
 

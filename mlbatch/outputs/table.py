@@ -140,7 +140,7 @@ def read_table(text: str, where: str) -> Rows:
 
 @dataclass(slots=True)
 class ScanRow:
-    """What scans.csv has about a scan, by sensor."""
+    """Values of a scan in scans.csv, by sensor."""
 
     complete: bool
     columns: tuple[int, ...] = ()

@@ -1,4 +1,4 @@
-"""What is wrong with a run, in plain words: from its report and its windows."""
+"""Problems of a run in plain words, from its report and its windows."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _NETWORK = (
     "the disk"
 )
 _POWER = "check the sensor's power, cable and log; the windows are written with complete = false"
-# What to do about a warning, by its code (docs/report.md).
+# Remedy for each warning, by its code (docs/report.md).
 REMEDIES = {
     "cut_off": "copy the file again, or record with tcpdump -U; scans end where the file does",
     "recording": "copy the file again; the readable part was used",
@@ -73,7 +73,7 @@ _MOST_STALLS = 6
 
 
 class Level(IntEnum):
-    """How serious a finding is."""
+    """Severity of a finding."""
 
     GOOD = 0
     NOTE = 1

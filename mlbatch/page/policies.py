@@ -1,4 +1,4 @@
-"""What is shown of a policy that joins sweeps, or of windows, by pages and by figures."""
+"""Figures of a fusion policy, or of windows, for pages and plots."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a page is made of: the report, the table of scans, and the output if it is there."""
+"""The data of a page: the report, the table of scans, and the output if it is there."""
 
 from __future__ import annotations
 
@@ -96,7 +96,7 @@ def _of_output(path: Path, report: Path | None) -> Source:
 
 
 def _container(path: Path) -> str:
-    """What recording a file may be; "" for others."""
+    """Kind of recording that a file may be; "" for other files."""
     if path.is_dir():
         return ""
     from mlbatch.readers import readers

@@ -1,4 +1,4 @@
-"""What recordings contain besides packets: their time and size, and messages of other topics."""
+"""Contents of recordings besides packets: time and size, and messages of other topics."""
 
 from __future__ import annotations
 

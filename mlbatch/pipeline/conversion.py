@@ -157,7 +157,7 @@ class Conversion:
                 self.warn(Note("max_wait", sensor.name, text))
 
     def _deskew(self) -> Deskew | ConstantVelocity | None:
-        """What moves columns, by `--deskew`; None without."""
+        """The object that moves columns for `--deskew`; None without."""
         job = self.job
         if not job.deskew:
             return None

@@ -195,7 +195,7 @@ class EarlierRun:
 
 
 def find(target: Path) -> EarlierRun | None:
-    """What an interrupted run to `target` has finished; ExportError while another run writes it."""
+    """Find the files that an interrupted run finished; ExportError while another run writes."""
     folder = partial_path(target)
     path = folder / FILES_JSONL
     if not path.is_file():
@@ -278,7 +278,7 @@ class Files:
         self.scans = 0 if self._earlier is None else self._earlier.scans
         self.run: Conversion | None = None
         self._journal: io.FileIO | None = None
-        # Content keys of the scans that are not yet in the journal, in order; then the scans of
+        # Digests of the input of scans that are not yet in the journal, in order; then the scans of
         # files that are not whole.
         self._contents: deque[int] = deque()
         self._unfinished: dict[Unit, list[FinishedScan]] = {}

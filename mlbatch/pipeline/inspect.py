@@ -240,7 +240,7 @@ class Inspection:
         return [head, *rows]
 
     def clocks_to_reference(self) -> list[list[str]]:
-        """The column of the matrix that the others follow from, head first."""
+        """The first column of the matrix, from which the others follow; row 0 is the head."""
         if self.clocks is None:
             return []
         reference = self.clocks.reference

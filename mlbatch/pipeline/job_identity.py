@@ -98,7 +98,7 @@ def input_identity(run: Conversion) -> dict[str, str]:
 
 
 def identity_of_parts(identity: Mapping[str, str]) -> dict[str, str]:
-    """What the identities of all shards of a conversion share, and the report of an output keeps.
+    """The identity that all shards of a conversion share; it is kept in the report.
 
     Recordings may be copies, which have other times.
     """
@@ -128,7 +128,7 @@ def read_identity(path: Path) -> dict[str, str]:
 
 
 def difference_of_outputs(old: Mapping[str, str], new: Mapping[str, str]) -> str:
-    """As `difference`, whichever versions made the outputs."""
+    """Return `difference`, but ignore the versions that made the outputs."""
     first, second = (
         {key: text for key, text in one.items() if key not in _VERSIONS} for one in (old, new)
     )

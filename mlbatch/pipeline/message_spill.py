@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 Key: TypeAlias = tuple[int, str, int]
 Entry: TypeAlias = tuple[Key, Message]
 
-# What is lost with the process needs no journal, and is one transaction that never ends.
+# The data may be lost with the process: no journal, and one transaction that never ends.
 _BEGIN = """
 PRAGMA journal_mode = OFF;
 PRAGMA synchronous = OFF;

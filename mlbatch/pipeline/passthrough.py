@@ -256,7 +256,7 @@ def selected(topics: Iterable[Topic], patterns: Sequence[str]) -> frozenset[str]
 
 
 class MessageQueue:
-    """Recorded messages until the scan of their time is written; `counts` by topic."""
+    """Holds recorded messages until the scan of their time is written; `counts` by topic."""
 
     def __init__(
         self, patterns: Sequence[str], encodings: frozenset[str], begin_ns: int | None = None

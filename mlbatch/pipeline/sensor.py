@@ -50,7 +50,7 @@ class SensorClock:
 
 
 class Limits(NamedTuple):
-    """Which points of a sensor are written; ranges in m."""
+    """Limits within which points of a sensor are written; ranges in m."""
 
     min_range_m: float
     max_range_m: float
@@ -146,7 +146,7 @@ class Sensor:
         return Pace(lidar.columns_per_s, lidar.lit_share, positions)
 
     def source(self) -> Source:
-        """What decoding needs of this sensor."""
+        """The input of decoding for this sensor."""
         return Source(
             self.lidar,
             self.ring,

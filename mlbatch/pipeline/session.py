@@ -202,7 +202,7 @@ class Session:
         *,
         forwards: bool = False,
     ) -> RunInfo:
-        """What is the same for all scans.
+        """The description that all scans share.
 
         rate_hz: exact rate as text; forwards: recorded messages are written, too.
         """

@@ -85,7 +85,7 @@ class Account:
     report: RunReport
 
     def shared(self) -> dict[str, Any]:
-        """What must be the same in the accounts of all shards, as JSON values."""
+        """Values that must be equal in the accounts of all shards, as JSON."""
         found = _fields(to_json(self))
         for name in ("shard", "scans", "table"):
             del found[name]

@@ -37,7 +37,7 @@ _ONE_CALL_BYTES = 16 << 20
 
 
 class _Stream(Protocol):
-    """What `Source` reads from; an error leaves the bytes of earlier calls valid."""
+    """Interface that `Source` reads from; an error leaves the bytes of earlier calls valid."""
 
     def readinto(self, target: memoryview) -> int | None: ...
 

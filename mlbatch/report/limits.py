@@ -26,7 +26,7 @@ class Limit(NamedTuple):
     is_percent: bool
 
     def exceeded(self, report: RunReport) -> str:
-        """What exceeds the limit, as text; "" if nothing does."""
+        """Text that says how the limit is exceeded; "" if it is not."""
         quantity = _QUANTITIES[self.quantity]
         for owner, (part, whole) in quantity.amounts(report):
             share = 100 * part / whole if whole else 0.0

@@ -94,7 +94,7 @@ class VelocityCounts:
 
 @dataclass(slots=True)
 class MotionLedger:
-    """What was moved; source: of the poses; to: instant of the window, as `--deskew-to`.
+    """Figures of moved columns; source: of the poses; to: instant of the window, as `--deskew-to`.
 
     poses: how many were used; windows_without_poses: left out, with `no_pose` columns; gyro_bias:
     rad/s, of IMU poses; ended: why there are no later poses; rotation: against that of the points;

@@ -36,7 +36,7 @@ Section: TypeAlias = dict[str, Json]
 SCHEMA = "mlbatch.report/1"
 
 
-# What differs from machine to machine.
+# Fields that differ from machine to machine.
 _OF_MACHINE = ("timing", "command", "identity")
 # The warning that a recording ends early.
 CUT_OFF = "cut_off"

@@ -36,7 +36,7 @@ _HOUSING = "_base_link"
 _POSE_KEYS = ("x", "y", "z", "roll", "pitch", "yaw")
 _AXES = ("x", "y", "z")
 _XYZW = ("x", "y", "z", "w")
-# What differs more in two files contradicts itself.
+# Poses of two files that differ more contradict each other.
 _SAME = 1e-9
 
 
@@ -173,7 +173,7 @@ def _tree(roots: Sequence[Node]) -> tuple[FrameTree, dict[str, str]]:
 
 
 def _keys(root: Node) -> str:
-    """What a file has, for errors."""
+    """Description of a file's content, for errors."""
     if root.kind == "mapping":
         return f"keys {some(list(root.entries)) or 'none'}"
     return root.shown

@@ -56,7 +56,7 @@ if TYPE_CHECKING:
 
 # `lidar_id` is a uint8.
 MAX_SENSORS = 256
-# What `inspect --write-rig` writes for extrinsics that nobody gave.
+# Value that `inspect --write-rig` writes for extrinsics that nobody gave.
 UNKNOWN = "unknown"
 MAX_OFFSET_S = 2**31
 

@@ -90,7 +90,7 @@ CONVENTION = PointRule()
 
 @dataclass(frozen=True, slots=True)
 class Zero:
-    """What times may count from; field: name and type; base: description of base_ns."""
+    """Candidate for the origin of times; field: name and type; base: description of base_ns."""
 
     field: str
     base_ns: int
@@ -229,7 +229,7 @@ def _conventional(kind: np.dtype[Any], high: float, zero: Zero) -> Reading:
 
 
 def convention(kind: np.dtype[Any], high: float) -> Reading | None:
-    """What drivers mean by times of a type whose largest is `high`; None if it is not known."""
+    """Unit and origin that drivers use for times of a type up to `high`; None if unknown."""
     if kind.kind != "f":
         return Reading(1, is_absolute=False)
     found = next((one.reading for one in _FLOAT_TIMES if one.above < high < one.below), None)

@@ -154,7 +154,7 @@ def read_cloud(message: Message, rules: Rules = by_convention) -> Cloud:
 
 @dataclass(frozen=True, slots=True)
 class CloudHead:
-    """What a message says of its lidars; lidar_ids: sorted, empty where it does not."""
+    """Lidars that a message names; lidar_ids: sorted, empty if it names none."""
 
     frame: str
     lidar_ids: tuple[int, ...]
@@ -408,7 +408,7 @@ def _nearest(error: str, name: str, known: Sequence[str]) -> FieldError:
 
 
 def _time_remedy(rising: Sequence[str], kind: type[CloudError]) -> str:
-    """What to do where the times of the points were not found."""
+    """Advice for a cloud without times of points."""
     instead = "record the raw packets, or clouds with times"
     if not rising:
         return f"none of them rises within the scan as times do: {instead}"

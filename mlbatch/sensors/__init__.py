@@ -46,7 +46,7 @@ MAX_CALIBRATION_BYTES = 16_000_000
 
 
 class Vendor(Protocol):
-    """What the folder of a vendor offers: necessary conditions, tested without `sensor`."""
+    """Interface of the folder of a vendor: necessary conditions, tested without `sensor`."""
 
     def may_send(self, size: int, packets: U8Array) -> bool:
         """Return False for payloads (k, >= size) that `describe` and `match_score` do not know."""
@@ -58,7 +58,7 @@ class Vendor(Protocol):
 
 
 class Plugin(Protocol):
-    """What the module `sensor` of a vendor offers."""
+    """Interface of the module `sensor` of a vendor."""
 
     VENDOR: str
     MODELS: tuple[SensorModel, ...]

@@ -72,7 +72,7 @@ class BaseLidar:
         return self._read(packets).faults
 
     def sequence(self, packets: U8Array) -> I64Array:
-        """(P,) number of packets; without one, the hash of the content."""
+        """(P,) packet counter; for sensors without one, a hash of the content."""
         return content_keys(packets) if self.reader is None else self._read(packets).key
 
     def column_headers(self, packets: U8Array, host_ns: I64Array) -> ColumnHeaders:

@@ -135,7 +135,7 @@ class SimulatedLidar(Protocol):
 
 
 class Simulator(Protocol):
-    """What the module `lidar` of a vendor offers."""
+    """Interface of the module `lidar` of a vendor."""
 
     MODELS: tuple[LidarModel, ...]
 

@@ -56,7 +56,7 @@ _RANK_OF_IMU = -1
 
 @dataclass(frozen=True, slots=True)
 class LidarFigures:
-    """What a lidar of the recording did; packets: lost ones included."""
+    """Counts of a lidar in the recording; packets: including lost ones."""
 
     name: str
     shots: int

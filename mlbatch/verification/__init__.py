@@ -1,6 +1,6 @@
 """Checks of an output from the output alone: `verify(path)` gives a `Verdict`.
 
-The readers of `outputs` report what is damaged, the checks here judge the rest. They define grid,
+The readers of `outputs` report damage, the modules here check the rest. They define grid,
 formats and point layouts a second time: only types are shared with the writers, so that a fault of
 the writers is not hidden by the same fault here.
 """

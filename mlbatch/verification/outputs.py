@@ -204,7 +204,7 @@ def _format(name: str, topics: TopicChecks) -> str:
 
 
 def _limits(topics: TopicChecks) -> dict[str, str]:
-    """What messages of a layout cannot show."""
+    """Reasons why checks are not possible on messages of a layout."""
     own = {
         check: f"the point layout {topics.layout} has no field for it"
         for check, layouts in LAYOUT_LIMITS.items()

@@ -257,7 +257,7 @@ def _first_point(scan: StoredScan, points: Points, sensor: int, ring: int) -> st
 
 
 class _RowTotals:
-    """What was found for each row of the table, (n,) each; (n, s) by sensor."""
+    """Values found for each row of the table, (n,) each; (n, s) by sensor."""
 
     def __init__(self, count: int, sensors: int) -> None:
         self.scans = np.zeros(count, np.int64)
@@ -333,7 +333,7 @@ class OutputTotals:
         self.at_limit = 0
         self.columns_of = np.zeros(sensors, np.int64)
         self.rings = Rings(np.full(sensors, _LATE_NS), np.full(sensors, -1))
-        # What all scans of the output show.
+        # True while every scan so far shows them.
         self.knows_points = True
         self.knows_columns = True
         self.knows_owners = True

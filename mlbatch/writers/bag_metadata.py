@@ -29,7 +29,7 @@ class BagTopic(NamedTuple):
 
 
 class BagFile(NamedTuple):
-    """What metadata.yaml says about one MCAP file; times: of the first and the last message."""
+    """The entry of one MCAP file in metadata.yaml; times: of the first and the last message."""
 
     name: str
     first_ns: int

@@ -95,7 +95,7 @@ class BagWriter(MessageWriter):
 
 
 class FileStages(NamedTuple):
-    """What is done with each file."""
+    """Actions on each file."""
 
     new: Callable[[Path], McapContainer]
     begin: Callable[[McapContainer, int], None]  # writes the first messages, at a log time

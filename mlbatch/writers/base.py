@@ -39,7 +39,7 @@ class FileSet(Protocol):
 
     @property
     def is_continued(self) -> bool:
-        """Whether the folder under construction has files that are whole."""
+        """Whether the folder under construction has finished files to continue after."""
         ...
 
     def is_due(self, index: int, slice_: int = 0, sensor: int | None = None) -> bool:

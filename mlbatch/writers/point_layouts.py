@@ -34,7 +34,7 @@ _ZERO = ("", 0)
 
 
 class Points(NamedTuple):
-    """What numpy fills records of, in the order of the file: (p,), or (slots, n) if organized."""
+    """Arrays to copy into records, in the order of the file: (p,), or (slots, n) if organized."""
 
     sensors: tuple[SensorInfo, ...]
     xyz: F32Array

@@ -120,7 +120,7 @@ class CloudTopics:
         return found
 
     def _offset_ns(self, topic: str, frame: str) -> int | None:
-        """What the rig adds to the times of a lidar; None where it converts their epoch."""
+        """Offset that the rig adds to the times of a lidar; None where it converts their epoch."""
         sensor = self._sensor(topic, frame)
         if sensor is None:
             return 0

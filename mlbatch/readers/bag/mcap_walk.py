@@ -359,7 +359,7 @@ class Walk:
 
 
 def _fault_in_chunk(span: Span, bound: int) -> str:
-    """What is wrong with a span whose chunk ends at `bound`."""
+    """Error text for a span whose chunk ends at `bound`; "" if it is good."""
     if span.opcode:
         return f"expected a record of a chunk, found one of kind 0x{span.opcode:02x}"
     if span.next + span.need > bound:
@@ -375,7 +375,7 @@ def _fault_of(head: ChunkHead) -> str:
 
 
 def _too_long(length: int, limit: int) -> str:
-    """What is wrong with a record of this length, or ""."""
+    """Error text for a record of this length; "" if it is good."""
     if length <= limit:
         return ""
     return f"expected a record of at most {limit} bytes, found one of {length}"

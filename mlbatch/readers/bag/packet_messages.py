@@ -34,7 +34,7 @@ from mlbatch.units import NS_PER_S
 
 @dataclass(frozen=True, slots=True)
 class Envelope:
-    """Where payloads are in a message type.
+    """Position of payloads in a message type.
 
     payload: field of the bytes; inside: field of the message(s) that contain it, "" for the message
     itself; size: field with the number of valid bytes; stamp: field of the receive time at the
@@ -127,7 +127,7 @@ class Shape:
     rest: int
 
     def fits(self, data: U8Array, begin: I64Array) -> BoolArray:
-        """Which of the messages of this shape's length that begin at `begin` have the shape."""
+        """True where a message at `begin`, of this shape's length, has the shape."""
         same: BoolArray = (u32(data, begin[:, None] + self.word) == self.value).all(axis=1)
         return same
 

@@ -127,7 +127,7 @@ def _portions(
 
 @dataclass(slots=True)
 class _Damage:
-    """What could not be read: one line each, and the number of messages."""
+    """One line for each problem while reading, and the number of messages lost."""
 
     notes: list[str] = field(default_factory=list)
     lost: int = 0

@@ -105,7 +105,7 @@ class Model:
     # Optical centre in the sensor frame.
     centre_mm: tuple[float, float, float]
     elevation_deg: tuple[float, float] | None
-    # As in the table of `mlbatch sensors`.
+    # Text for the table of `mlbatch sensors`.
     verified: str
     same_packets_as: str = ""
     header: int = 12

@@ -73,7 +73,7 @@ class Document(NamedTuple):
         return value
 
     def integer(self, key: str, low: int, high: int) -> int | None:
-        """A whole number from low to high, or None if absent."""
+        """Return a whole number from low to high, or None if the field is absent."""
         value = self.values.get(key)
         if value is None:
             return None
@@ -101,7 +101,7 @@ class Document(NamedTuple):
         return self._finite(key, expected, value)
 
     def pose_mm(self, key: str, most_m: float) -> F64Array | None:
-        """As `pose`, millimetres in the file, metres here; most_m: longest translation."""
+        """Return a pose in metres; the file has millimetres. most_m: longest translation."""
         pose = self.pose(key, most_m * MM_PER_M, "mm")
         if pose is not None:
             self.refuse_metres(key, float(np.linalg.norm(pose[:3, 3])))

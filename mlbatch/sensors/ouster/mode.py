@@ -33,7 +33,7 @@ _AGREE = 0.75
 
 
 class Seen(NamedTuple):
-    """What packets show: 0 where too few were seen.
+    """Mode by the packets: 0 where too few were seen.
 
     columns: of a revolution; step_ns: from column to column; highest_id: of their columns;
     beyond: share of the packets with ids beyond the mode of the metadata.
@@ -87,7 +87,7 @@ def as_sent(described: Metadata, seen: Seen) -> Metadata:
 
 
 def seen_in(described: Metadata, headers: Headers, packets: U8Array, found: ColumnHeaders) -> Seen:
-    """What intact packets (P, size) of the unit show; found: their columns, of any id."""
+    """Mode by intact packets (P, size) of the unit; found: their columns, of any id."""
     valid = found.valid
     mid = found.encoder
     if not valid.any():

@@ -140,7 +140,7 @@ class OusterCalibration:
         return OusterLidar(described, self.model, self.serial, "crc" in options)
 
     def _seen(self, packets: U8Array) -> Seen:
-        """What intact packets of the unit show of its mode."""
+        """Mode of the unit by its intact packets."""
         found = self._reader.read_rows(packets).columns
         return seen_in(self.metadata, self._headers, packets, found)
 

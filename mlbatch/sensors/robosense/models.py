@@ -157,7 +157,7 @@ class Model:
     angles: AngleOffsets
     # By value of DIFOP byte 300.
     modes: Mapping[int, ReturnMode]
-    # As in the table of `mlbatch sensors`.
+    # Text for the table of `mlbatch sensors`.
     verified: str = "one source"
     is_calendar: bool = False
     range_mask: int = 0xFFFF

@@ -68,7 +68,7 @@ class Model:
     # The packet stamp may be that of the last firing (`packet_stamp=end`).
     stamp_may_end: bool = False
     product: int | None = None
-    # As in the table of `mlbatch sensors`.
+    # Text for the table of `mlbatch sensors`.
     verified: str = "two sources"
 
     def firing_ns(self, sequence_ns: float) -> I64Array:

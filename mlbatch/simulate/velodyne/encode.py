@@ -52,7 +52,7 @@ class VelodyneSpec:
 
     @property
     def table(self) -> Table:
-        """What the sheet says of the model."""
+        """The row of the model in the data sheet."""
         return MODELS[self.model]
 
     @property

@@ -1,4 +1,4 @@
-"""What docs/sources/velodyne.md says of every Velodyne model, typed once more for the encoder.
+"""Every Velodyne model by docs/sources/velodyne.md, typed once more for the encoder.
 
 Sections 1, 2 and 6. The HDL-64E has no beams of its own: `calibration_yaml` gives those of a unit
 that does not exist, in which corrections have the usual size.
