@@ -16,7 +16,7 @@ from mlbatch.errors import UsageError
 from mlbatch.options import INSTANTS
 from mlbatch.pipeline.job import Job, check_max_bag_s
 from mlbatch.pipeline.output import OutputRequest
-from mlbatch.python.options import RatedOptions, SessionOptions, choice, session_job, window_job
+from mlbatch.python.options import ScanOptions, choice, session_job, window_job
 from mlbatch.sensors import DECODE_OPTIONS
 from mlbatch.units import parse_rate
 from mlbatch.writers import parse_jobs
@@ -27,27 +27,17 @@ if TYPE_CHECKING:
     from mlbatch.report.limits import Limit
 
 
-# Options whose values need no text to be read, by the tables of Python.
-_SESSION = ("rig", "identity_extrinsics", "clock", "align_clocks", "align_to", "strict")
-_SESSION_LISTS = ("metadata", "only", "ignore")
-_WINDOWS = (
-    *("start", "end", "slices", "layout", "sort", "split", "keep_partial", "keep_repeated"),
-    *("drop_incomplete", "max_wait", "min_range", "max_range", "batching", "batching_times"),
-    "deskew_to",
-)
-
-
 def job_of(recordings: Sequence[Path], values: Mapping[str, Any]) -> Job:
     """The job of a conversion, from the values of its options."""
-    session: dict[str, Any] = {name: values[name] for name in _SESSION}
-    session |= {name: tuple(values[name] or ()) for name in _SESSION_LISTS}
-    session["decode"] = decode_options(values["decode"] or ())
-    windows: dict[str, Any] = {name: values[name] for name in _WINDOWS}
-    windows["rate"] = None if values["rate"] is None else rate(values["rate"])
-    windows["deskew"] = values["deskew"] or None
-    windows["exclude_boxes"] = tuple(box_m(text) for text in values["exclude_box"] or ())
-    job = session_job(tuple(recordings), cast(SessionOptions, session), long_name)
-    job = window_job(job, cast(RatedOptions, windows), long_name)
+    # An option that is not given is left out, as in Python.
+    given = {name: value for name, value in values.items() if value is not None}
+    # Options with another form than in Python.
+    given["decode"] = decode_options(values["decode"] or ())
+    given["rate"] = None if values["rate"] is None else rate(values["rate"])
+    given["deskew"] = values["deskew"] or None
+    given["exclude_boxes"] = tuple(box_m(text) for text in values["exclude_box"] or ())
+    options = cast(ScanOptions, given)
+    job = window_job(session_job(tuple(recordings), options, long_name), options, long_name)
     return replace(
         job,
         stamp=choice("--stamp", values["stamp"], INSTANTS),
