@@ -39,8 +39,8 @@ class Option:
     """An option of a conversion.
 
     name: as in a rig, with _ for -; about: one line of help; flags: further spellings on the
-    command line; words: known values, `is_open` if there are others; low, high: bounds of a number;
-    in_rig: whether a rig may keep it; hidden: not in the help.
+    command line; words: known values, `is_open` if there are others; low, high: bounds of a number
+    in a rig; in_rig: whether a rig may keep it; hidden: not in the help.
     """
 
     name: str

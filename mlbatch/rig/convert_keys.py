@@ -31,6 +31,8 @@ _TEXT = re.compile(r"\S(.*\S)?")
 # Values of `deskew` that are no files.
 POSE_MODELS = ("imu", "constant-velocity")
 _MOST_JOBS = 64
+# Of an option without a bound.
+_MOST_WHOLE = 2**31
 
 Values = tuple[str, ...]
 
@@ -69,6 +71,11 @@ _OTHERS: Final[Mapping[str, tuple[Callable[[Node], Values], Form]]] = {
 }
 
 
+def _bounds(option: Option) -> tuple[int, int]:
+    """The lowest and the highest value of a whole number."""
+    return int(option.low or 0), _MOST_WHOLE if option.high is None else int(option.high)
+
+
 def _value(option: Option, node: Node) -> Values:
     """The value of an option, as on the command line."""
     if option.kind == options.FLAG:
@@ -77,7 +84,7 @@ def _value(option: Option, node: Node) -> Values:
         items = node.items if node.kind == "list" else (node,)
         return tuple(item.word("text, or a list of texts", _TEXT) for item in items)
     if option.kind == options.WHOLE:
-        return (str(node.whole(int(option.low or 0), int(option.high or 0))),)
+        return (str(node.whole(*_bounds(option))),)
     if option.kind == options.NUMBER:
         low = option.low or 0.0
         high = option.high
@@ -97,20 +104,21 @@ def _form(option: Option) -> Form:
     if option.kind == options.TEXTS:
         return {"anyOf": [TEXT, {"type": "array", "items": TEXT}]}
     if option.kind == options.WHOLE:
-        return whole_form(int(option.low or 0), int(option.high or 0))
+        return whole_form(*_bounds(option))
     if option.kind == options.NUMBER:
         bounds = {"minimum": option.low, "maximum": option.high}
         return {"type": "number", **{name: at for name, at in bounds.items() if at is not None}}
     return choice_form(*option.words) if option.words and not option.is_open else TEXT
 
 
-def _key(option: Option) -> Key[Values]:
+def key_of(option: Option) -> Key[Values]:
+    """The key of a rig that keeps an option."""
     read, form = _OTHERS.get(option.name) or (partial(_value, option), _form(option))
     return Key(option.name, read, (), form, option.about)
 
 
 CONVERT: tuple[Key[Values], ...] = tuple(
-    _key(option) for option in options.CONVERT if option.in_rig
+    key_of(option) for option in options.CONVERT if option.in_rig
 )
 FORM: Form = mapping_form(CONVERT)
 

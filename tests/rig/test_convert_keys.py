@@ -7,9 +7,11 @@ from pathlib import Path
 import pytest
 
 from mlbatch.errors import RigError
-from mlbatch.rig.convert_keys import CONVERT, RigOption
+from mlbatch.options import WHOLE, Option
+from mlbatch.rig.convert_keys import CONVERT, RigOption, key_of
 from mlbatch.rig.rig import Rig, RigSensor, read_rig
 from mlbatch.rig.write import write_rig
+from mlbatch.rig.yaml_tree import read_yaml
 from tests.contract.test_help import OPTIONS
 
 SENSORS = "sensors: [{name: a}]\n"
@@ -60,6 +62,17 @@ convert:
     }
     places = {option.name: option.place for option in found}
     assert places["jobs"] == f"{tmp_path / 'rig.yaml'}:7: convert.jobs"
+
+
+def test_a_whole_number_without_an_upper_bound_may_be_large(tmp_path: Path) -> None:
+    key = key_of(Option("points", WHOLE, "Selection", "Points.", low=1))
+    assert key.form == {"type": "integer", "minimum": 1, "maximum": 2**31}
+    file = tmp_path / "one.yaml"
+    file.write_text("70000")
+    assert key.read(read_yaml(file)) == ("70000",)
+    file.write_text("0")
+    with pytest.raises(RigError, match="a whole number from 1 to"):
+        key.read(read_yaml(file))
 
 
 def test_a_trajectory_is_relative_to_the_rig_file_as_all_paths_in_it(tmp_path: Path) -> None:
