@@ -5,15 +5,43 @@ A reader gives what it can read, and notes what is not as it should be under the
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from typing import Final
 
 import numpy as np
 
 from mlbatch.arrays import BoolArray
 from mlbatch.errors import RecordingError
 
+# Every check, in the order in which a verdict shows them; docs/verify.md says what each requires.
+CHECKS: Final = (
+    "container",
+    "names",
+    "layout",
+    "metadata",
+    "grid",
+    "index",
+    "t_init",
+    "stamps",
+    "columns",
+    "order",
+    "times",
+    "finite",
+    "geometry",
+    "sensors",
+    "rings",
+    "returns",
+    "duplicates",
+    "table",
+    "checksum",
+    "ledger",
+    "report",
+    "tf_static",
+    "frames",
+    "imu",
+    "messages",
+)
 # Violations that are kept; all are counted.
 MAX_KEPT = 1000
 _MAX_TEXT = 160
@@ -47,10 +75,10 @@ class Violation:
 
 @dataclass(slots=True)
 class CheckLog:
-    """Counts checked values and collects violations."""
+    """Counts checked values and collects violations; KeyError for a check that `CHECKS` lacks."""
 
-    checked: Counter[str] = field(default_factory=Counter)
-    failed: Counter[str] = field(default_factory=Counter)
+    checked: dict[str, int] = field(default_factory=lambda: dict.fromkeys(CHECKS, 0))
+    failed: dict[str, int] = field(default_factory=lambda: dict.fromkeys(CHECKS, 0))
     violations: list[Violation] = field(default_factory=list)
 
     def ok(self, check: str, count: int = 1) -> None:

@@ -10,11 +10,11 @@ from __future__ import annotations
 from os import PathLike
 from pathlib import Path
 
-from mlbatch.outputs.damage import CheckLog, VerifyError, Violation
+from mlbatch.outputs.damage import CHECKS, CheckLog, VerifyError, Violation
 from mlbatch.outputs.run_files import RunFiles
 from mlbatch.verification.examination import Progress
 from mlbatch.verification.outputs import Output, check_output
-from mlbatch.verification.verdict import CHECKS, Check, Verdict
+from mlbatch.verification.verdict import Check, Verdict
 
 __all__ = ["CHECKS", "Check", "Verdict", "VerifyError", "Violation", "verify"]
 

@@ -23,6 +23,13 @@ def test_a_violation_names_the_first_and_counts_all() -> None:
     assert list(outcome) == list(CHECKS)
 
 
+def test_a_check_that_no_verdict_would_show_is_refused() -> None:
+    with pytest.raises(KeyError, match="gird"):
+        CheckLog().fail("gird", "here", 1, 2)
+    with pytest.raises(KeyError, match="gird"):
+        CheckLog().ok("gird")
+
+
 def test_violations_are_kept_up_to_a_limit() -> None:
     log = CheckLog()
     for _ in range(MAX_KEPT + 7):
