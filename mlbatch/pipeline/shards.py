@@ -35,6 +35,7 @@ from mlbatch.writers import (
     write_text,
 )
 from mlbatch.writers.bag_metadata import METADATA
+from mlbatch.writers.formats import built_in_names
 from mlbatch.writers.output_file import file_crc
 
 SCHEMA = "mlbatch.shard/4"
@@ -54,8 +55,9 @@ def check_format(name: str, options: WriterOptions) -> None:
 
 def not_in_files(name: str) -> UsageError:
     """The error about a format that writes one file; name: of the format."""
+    formats = [one for one in built_in_names() if has_several_files(one, WriterOptions())]
     return UsageError(
-        f"--shard: expected a format with several files (npz, ply, pcd, las, laz, kitti, nuscenes; "
+        f"--shard: expected a format with several files ({', '.join(formats)}; "
         f"rosbag2 with --max-bag-duration), found {name}, one file for all scans; give --format "
         "npz and a folder, or --format rosbag2 --max-bag-duration 60"
     )
