@@ -189,6 +189,18 @@ def _anchors(page: Path) -> set[str]:
     return {slug.replace(" ", "-") for slug in slugs} | set(re.findall(r'<a id="([^"]+)"', text))
 
 
+@pytest.mark.parametrize("name", ["architecture.md", "extend.md"])
+def test_files_that_a_page_names_exist(name: str) -> None:
+    """Paths in code spans, from the repository, from mlbatch/ or from the end of a path there."""
+    named = re.findall(r"`((?:[\w.-]+/)*\w+\.(?:py|c|h|txt))[`,]", _page(name))
+    folders = [ROOT / top for top in ("mlbatch", "tests", "examples", "docs", ".ci")]
+    files = [
+        f"/{path.relative_to(ROOT).as_posix()}" for top in folders for path in top.rglob("*.*")
+    ]
+    assert named
+    assert [one for one in named if not any(file.endswith(f"/{one}") for file in files)] == []
+
+
 def test_every_page_is_in_the_navigation() -> None:
     made = runpy.run_path(str(ROOT / "docs" / "site_pages.py"))["made_pages"]()
     nav = re.findall(r"([\w/-]+\.md)$", (ROOT / "mkdocs.yml").read_text("utf-8"), re.MULTILINE)
