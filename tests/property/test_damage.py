@@ -1,6 +1,6 @@
 """Damaged packets: every run balances its ledgers or ends in one clear line, and soon.
 
-Damaged files, rigs and metadata: tests/fuzz.
+Damaged payloads, files, rigs and metadata: tests/fuzz.
 """
 
 from __future__ import annotations
@@ -107,14 +107,6 @@ def damaged_frames(rng: random.Random, records: Sequence[tuple[int, bytes]], nam
         for (host_ns, _), frames in zip(records, parts, strict=True)
         for frame in frames
     ]
-
-
-def damaged_payloads(rng: random.Random, sent: Sequence[Datagram], name: str) -> Records:
-    """Payloads in sound frames: what a faulty sensor or relay sends."""
-    parts: list[tuple[int, Datagram, bytes]] = []
-    for one, payloads in zip(sent, damaged(rng, [d.payload for d in sent], name), strict=True):
-        parts += [(one.host_ns, one, payload) for payload in payloads]
-    return [replace(one, host_ns=host_ns, payload=data).frame() for host_ns, one, data in parts]
 
 
 # Timestamps at the limits of accepted values, and of 8 bytes.
@@ -320,15 +312,6 @@ def recorded(rng: random.Random, records: Records, folder: Path) -> tuple[Path, 
 def test_damaged_frames(name: str, seed: int, tmp_path: Path) -> None:
     rng = random.Random(f"frames {name} {seed}")
     records = damaged_frames(rng, frames(LENGTH_NS), name)
-    job = replace(rng.choice(JOBS), recordings=recorded(rng, records, tmp_path))
-    both_buffers(job, len(records), rng.choice(BUFFERS))
-
-
-@pytest.mark.parametrize("seed", range(12))
-@pytest.mark.parametrize("name", NAMES)
-def test_damaged_payloads(name: str, seed: int, tmp_path: Path) -> None:
-    rng = random.Random(f"payloads {name} {seed}")
-    records = damaged_payloads(rng, datagrams(LENGTH_NS), name)
     job = replace(rng.choice(JOBS), recordings=recorded(rng, records, tmp_path))
     both_buffers(job, len(records), rng.choice(BUFFERS))
 
