@@ -27,10 +27,10 @@ from tests.builders.seen import (
     Eye,
     Seen,
     hesai_sees,
-    pose,
     robosense_sees,
     velodyne_sees,
 )
+from tests.builders.two_lidars import pose
 
 PACKETS = 12
 SOURCE = "192.168.1.201"

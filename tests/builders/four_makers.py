@@ -30,10 +30,10 @@ from tests.builders.seen import (
     Seen,
     hesai_sees,
     ouster_sees,
-    pose,
     robosense_sees,
     velodyne_sees,
 )
+from tests.builders.two_lidars import pose
 
 FOLDER = Path(__file__).resolve().parents[2] / "fixtures" / "four_makers"
 HOST_IP = "192.168.1.10"

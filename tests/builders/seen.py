@@ -112,21 +112,6 @@ class Eye:
         return self.scene.cast(start, ray), np.array(brightness, np.float64)[surface]
 
 
-def pose(
-    translation_m: tuple[float, float, float], rpy_deg: tuple[float, float, float]
-) -> F64Array:
-    """(4, 4) by rotations about the fixed axes x, y, z: Rz Ry Rx (docs/rig.md)."""
-    matrix = np.eye(4)
-    for (one, other), angle in zip(((1, 2), (2, 0), (0, 1)), np.radians(rpy_deg), strict=True):
-        rotation = np.eye(4)
-        rotation[one, one] = rotation[other, other] = np.cos(angle)
-        rotation[other, one] = np.sin(angle)
-        rotation[one, other] = -np.sin(angle)
-        matrix = rotation @ matrix
-    matrix[:3, 3] = translation_m
-    return matrix
-
-
 def velodyne_sees(spec: velodyne.VelodyneSpec, eye: Eye, packets: int) -> Seen:
     """A Velodyne's stamps are whole us, each of the first firing of a packet (sheet, section 2)."""
     table = spec.table

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import struct
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -118,17 +118,22 @@ def azimuth_deg(lidar: FixtureLidar) -> list[float]:
     return [round(pattern[beam % 4] + 0.01 * (beam * 3 % 7), 2) for beam in range(BEAMS)]
 
 
-def body_from_sensor(lidar: FixtureLidar) -> F64Array:
-    """Extrinsics (4, 4): rotations about the fixed axes x, y, z; metres (docs/rig.md)."""
-    (cr, cp, cy), (sr, sp, sy) = (f(np.radians(lidar.rpy_deg)) for f in (np.cos, np.sin))
-    pose = np.eye(4)
-    pose[:3, :3] = [
+def pose(translation_m: Sequence[float], rpy_deg: Sequence[float]) -> F64Array:
+    """(4, 4) by rotations about the fixed axes x, y, z; metres (docs/rig.md)."""
+    (cr, cp, cy), (sr, sp, sy) = (f(np.radians(rpy_deg)) for f in (np.cos, np.sin))
+    matrix = np.eye(4)
+    matrix[:3, :3] = [
         [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr],
         [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr],
         [-sp, cp * sr, cp * cr],
     ]
-    pose[:3, 3] = lidar.translation_m
-    return pose
+    matrix[:3, 3] = translation_m
+    return matrix
+
+
+def body_from_sensor(lidar: FixtureLidar) -> F64Array:
+    """Extrinsics."""
+    return pose(lidar.translation_m, lidar.rpy_deg)
 
 
 def rays(lidar: FixtureLidar) -> tuple[F64Array, F64Array]:
@@ -151,11 +156,11 @@ def rays(lidar: FixtureLidar) -> tuple[F64Array, F64Array]:
     origin = np.zeros_like(direction)
     origin[..., 0] = offset_m * np.cos(theta)
     origin[..., 1] = offset_m * np.sin(theta)
-    pose = body_from_sensor(lidar)
+    matrix = body_from_sensor(lidar)
     sensor_origin = origin * half_revolution + (0.0, 0.0, lift_m)
     return (
-        (sensor_origin @ pose[:3, :3].T + pose[:3, 3]).reshape(-1, 3),
-        (direction * half_revolution @ pose[:3, :3].T).reshape(-1, 3),
+        (sensor_origin @ matrix[:3, :3].T + matrix[:3, 3]).reshape(-1, 3),
+        (direction * half_revolution @ matrix[:3, :3].T).reshape(-1, 3),
     )
 
 
