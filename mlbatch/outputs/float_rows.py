@@ -48,26 +48,6 @@ NUSCENES_LIMITS = _COMMON | {
 }
 
 
-@dataclass(frozen=True, slots=True)
-class FloatRows:
-    """Rows of a scan; times and sensors only where the format has them."""
-
-    rows: F32Array  # (p, 4), or (p, 5) with rings
-    times: F32Array | None = None  # (p, 2): s after the start, sensor
-
-
-def read_rows(file: ScanFile) -> FloatRows:
-    """The rows of a file, and of the second one of nuscenes; DamageError for another size."""
-    if file.suffix == KITTI_SUFFIX:
-        return FloatRows(_rows(file.read(), 4))
-    rows = _rows(file.read(), 5)
-    path = file.path.with_name(file.path.name.removesuffix(NUSCENES_SUFFIX) + TIME_SUFFIX)
-    times = _rows(file.read(path), 2)
-    if len(times) != len(rows):
-        raise DamageError(f"{len(rows)} rows in {path.name}", str(len(times)))
-    return FloatRows(rows, times)
-
-
 def _rows(data: bytes, columns: int) -> F32Array:
     if len(data) % (columns * _BYTES):
         raise DamageError(f"rows of {columns} float32", f"{len(data)} bytes")
@@ -75,7 +55,7 @@ def _rows(data: bytes, columns: int) -> F32Array:
     return rows
 
 
-def read_times(folder: Path, files: list[ScanFile]) -> list[int]:
+def _read_times(folder: Path, files: list[ScanFile]) -> list[int]:
     """Starts of the scans of a folder, ns, in the order of their names."""
     path = folder / TIMES_TXT
     try:
@@ -91,19 +71,6 @@ def read_times(folder: Path, files: list[ScanFile]) -> list[int]:
             raise DamageError(f"seconds with 9 decimals in {TIMES_TXT} line {number}", repr(line))
         starts.append(int(found[1]) * _NS + int(found[2]))
     return starts
-
-
-def start_of(file: ScanFile, known: dict[Path, dict[Path, int]]) -> int:
-    """The start of a scan in the times.txt of its folder, ns; known: starts by folder and file."""
-    folder = file.path.parent
-    if folder not in known:
-        inside = [
-            one for one in scan_files(CheckLog(), folder, file.suffix) if one.path.parent == folder
-        ]
-        inside.sort(key=lambda one: (one.index < 0, one.index, one.slice or 0))
-        starts = read_times(folder, inside)
-        known[folder] = {one.path: start for one, start in zip(inside, starts, strict=True)}
-    return known[folder][file.path]
 
 
 @dataclass(slots=True)
@@ -124,23 +91,49 @@ class RowReader(ScanReader):
 
     def scan(self, file: ScanFile) -> StoredScan:
         """One scan, checked against the others."""
-        found = read_rows(file)
+        is_kitti = file.suffix == KITTI_SUFFIX
+        rows = _rows(file.read(), 4 if is_kitti else 5)
+        times = None if is_kitti else self._times(file, len(rows))
         self.log.ok("layout")
         part = file.slice or 0
         file.check_name(self.log, file.index, part, self._slices)
         scan = StoredScan(
             where=file.where,
-            start_ns=start_of(file, self._starts),
+            start_ns=self._start_of(file),
             index=file.index,
             slice=part,
-            xyz=found.rows[:, :3],
+            xyz=rows[:, :3],
             organized=False,
             sensor=file.sensor_index(self.log, self.sensors),
-            intensity=found.rows[:, 3],
+            intensity=rows[:, 3],
         )
-        if found.times is not None:
-            self._label(scan, found.rows[:, 4], found.times[:, 0], found.times[:, 1])
+        if times is not None:
+            self._label(scan, rows[:, 4], times[:, 0], times[:, 1])
         return scan
+
+    def _times(self, file: ScanFile, count: int) -> F32Array:
+        """The second file of a scan of nuscenes: s after the start, and sensor, (p, 2)."""
+        path = file.path.with_name(file.path.name.removesuffix(NUSCENES_SUFFIX) + TIME_SUFFIX)
+        times = _rows(file.read(path), 2)
+        if len(times) != count:
+            raise DamageError(f"{count} rows in {path.name}", str(len(times)))
+        return times
+
+    def _start_of(self, file: ScanFile) -> int:
+        """The start of a scan in the times.txt of its folder, ns."""
+        folder = file.path.parent
+        if folder not in self._starts:
+            inside = [
+                one
+                for one in scan_files(CheckLog(), folder, file.suffix)
+                if one.path.parent == folder
+            ]
+            inside.sort(key=lambda one: (one.index < 0, one.index, one.slice or 0))
+            starts = _read_times(folder, inside)
+            self._starts[folder] = {
+                one.path: start for one, start in zip(inside, starts, strict=True)
+            }
+        return self._starts[folder][file.path]
 
     def _label(self, scan: StoredScan, ring: F32Array, time_s: F32Array, lidar: F32Array) -> None:
         """Add what only nuscenes has."""

@@ -7,14 +7,13 @@ from __future__ import annotations
 
 import importlib
 import struct
-from dataclasses import dataclass
 from io import BytesIO
 from types import ModuleType
 from typing import Any
 
 import numpy as np
 
-from mlbatch.arrays import BoolArray, F32Array, F64Array, I64Array
+from mlbatch.arrays import BoolArray, F64Array, I64Array
 from mlbatch.errors import install_extra
 from mlbatch.outputs.commented import CommentedReader, StoredPoints
 from mlbatch.outputs.comments import ScanComments
@@ -56,33 +55,19 @@ _UTC_S_SINCE = 1_483_228_800
 _TIME_ERROR_S = 5e-7
 
 
-@dataclass(frozen=True, slots=True)
-class LasFile:
-    """Comments and points of a file; points: by name, as in docs/formats.md."""
-
-    comments: ScanComments
-    points: Any
-    xyz: F32Array
-    has_reflectivity: bool
-
-    def values(self, name: str) -> Any:
-        """An extra or standard dimension, (p,)."""
-        return np.asarray(self.points[name])
-
-
-def load_laspy(what: str) -> ModuleType:
+def _laspy() -> ModuleType:
     """laspy; VerifyError without it."""
     try:
         importlib.import_module("lazrs")
         return importlib.import_module("laspy")
     except ImportError as err:
         raise VerifyError(
-            f"{what}: expected the packages laspy and lazrs to read LAS and LAZ, found none "
+            "LAS files: expected the packages laspy and lazrs to read LAS and LAZ, found none "
             f"({err}); {install_extra('las')}"
         ) from err
 
 
-def check_head(data: bytes) -> None:
+def _check_head(data: bytes) -> None:
     """Check numbers of the header that laspy and lazrs allocate for; DamageError for others."""
     if len(data) < _HEAD.size:
         raise DamageError(f"a header of {_HEAD.size} bytes", f"{len(data)} bytes")
@@ -110,11 +95,14 @@ def _check_chunks(data: bytes, begin: int) -> None:
         raise DamageError(f"at most {len(data)} chunks", str(chunks))
 
 
-def read_las(data: bytes) -> LasFile:
-    """A file of mlbatch; DamageError for another one."""
-    laspy = load_laspy("LAS files")
+def _parsed(data: bytes) -> tuple[ScanComments, Any, bool]:
+    """Comments, points by name as in docs/formats.md, and whether there are reflectivities.
+
+    DamageError for another file.
+    """
+    laspy = _laspy()
     with library_errors("a LAS or LAZ file"):
-        check_head(data)
+        _check_head(data)
         found = _read(laspy, data)
         header = found.header
         # Points that are missing at the end are read as fewer.
@@ -133,10 +121,8 @@ def read_las(data: bytes) -> LasFile:
         if header.point_format.id != _POINT_FORMAT or set(header.scales.tolist()) != {_SCALE_M}:
             expected = f"point format {_POINT_FORMAT} in steps of {_SCALE_M} m"
             raise DamageError(expected, f"{header.point_format.id}, {header.scales.tolist()}")
-        comments = ScanComments.of_lines(texts[0].decode("utf-8", "replace").splitlines())
-        axes = [np.asarray(found.points[name]) * _SCALE_M for name in "XYZ"]
-        xyz: F32Array = np.stack(axes, axis=-1).astype(np.float32)
-        return LasFile(comments, found.points, xyz, "reflectivity" in extra)
+        lines = texts[0].decode("utf-8", "replace").splitlines()
+        return ScanComments.of_lines(lines), found.points, "reflectivity" in extra
 
 
 def _read(laspy: ModuleType, data: bytes) -> Any:
@@ -157,27 +143,28 @@ class LasReader(CommentedReader):
 
     def parse(self, data: bytes) -> tuple[ScanComments, StoredPoints]:
         """Comments and points of a file, checked against each other."""
-        file = read_las(data)
-        time_ns: I64Array = file.values("time_ns").astype(np.int64)
-        self._check_times(file, time_ns)
-        self._check_fields(file)
-        return file.comments, StoredPoints(
-            xyz=file.xyz,
+        comments, points, has_reflectivity = _parsed(data)
+        time_ns: I64Array = np.asarray(points["time_ns"]).astype(np.int64)
+        self._check_times(comments, points, time_ns)
+        self._check_fields(comments, points)
+        axes = [np.asarray(points[name]) * _SCALE_M for name in "XYZ"]
+        return comments, StoredPoints(
+            xyz=np.stack(axes, axis=-1).astype(np.float32),
             time_s=None,
             time_ns=time_ns,
-            ring=file.values("ring"),
-            return_type=file.values("return_type"),
-            lidar_id=np.clip(file.values("point_source_id").astype(np.int64) - 1, 0, 255).astype(
-                np.uint8
-            ),
-            intensity=file.values("intensity_f32"),
-            reflectivity=file.values("reflectivity") if file.has_reflectivity else None,
+            ring=np.asarray(points["ring"]),
+            return_type=np.asarray(points["return_type"]),
+            lidar_id=np.clip(
+                np.asarray(points["point_source_id"]).astype(np.int64) - 1, 0, 255
+            ).astype(np.uint8),
+            intensity=np.asarray(points["intensity_f32"]),
+            reflectivity=np.asarray(points["reflectivity"]) if has_reflectivity else None,
         )
 
-    def _check_times(self, file: LasFile, time_ns: I64Array) -> None:
+    def _check_times(self, comments: ScanComments, points: Any, time_ns: I64Array) -> None:
         """`gps_time` is the time of the clock as GPS time; of UTC before 2017 it is unchecked."""
-        timescale = file.comments.by_name.get("timescale")
-        start_ns = file.comments.number("start_ns")
+        timescale = comments.by_name.get("timescale")
+        start_ns = comments.number("start_ns")
         shift_s = 0
         if timescale == "tai":
             shift_s = _GPS_TAI_S - _GPS_EPOCH_S
@@ -187,27 +174,27 @@ class LasReader(CommentedReader):
             shift_s = _GPS_UTC_S - _GPS_EPOCH_S
         whole_s, rest_ns = divmod(start_ns + shift_s * _NS, _NS)
         expected: F64Array = (time_ns + rest_ns) / _NS + whole_s
-        gps_s: F64Array = file.values("gps_time")
+        gps_s: F64Array = np.asarray(points["gps_time"])
         bad: BoolArray = np.logical_not(np.abs(gps_s - expected) < _TIME_ERROR_S)
-        where = f"scan {file.comments.by_name.get('index')} gps_time of point"
+        where = f"scan {comments.by_name.get('index')} gps_time of point"
         self.log.none("times", where, bad, "start_ns + time_ns as GPS time", gps_s.item)
 
-    def _check_fields(self, file: LasFile) -> None:
+    def _check_fields(self, comments: ScanComments, points: Any) -> None:
         """Standard fields have the values of the extra bytes."""
-        where = f"scan {file.comments.by_name.get('index')}"
-        kind = np.minimum(file.values("return_type"), len(_RETURNS) - 1)
+        where = f"scan {comments.by_name.get('index')}"
+        kind = np.minimum(np.asarray(points["return_type"]), len(_RETURNS) - 1)
         for axis, name in enumerate(("return_number", "number_of_returns")):
-            found: I64Array = file.values(name).astype(np.int64)
+            found: I64Array = np.asarray(points[name]).astype(np.int64)
             bad: BoolArray = found != _RETURNS[kind, axis]
             self.log.none("returns", f"{where} {name} of point", bad, "by return_type", found.item)
         exact: F64Array = np.clip(
-            np.rint(np.nan_to_num(file.values("intensity_f32"))), 0, _MOST_INTENSITY
+            np.rint(np.nan_to_num(np.asarray(points["intensity_f32"]))), 0, _MOST_INTENSITY
         )
-        intensity: I64Array = file.values("intensity").astype(np.int64)
+        intensity: I64Array = np.asarray(points["intensity"]).astype(np.int64)
         different: BoolArray = intensity != exact
         self.log.none(
             "layout", f"{where} intensity of point", different, "intensity_f32", intensity.item
         )
-        source: I64Array = file.values("point_source_id").astype(np.int64)
+        source: I64Array = np.asarray(points["point_source_id"]).astype(np.int64)
         none: BoolArray = (source < 1) | (source > 256)
         self.log.none("sensors", f"{where} point_source_id of point", none, "1 to 256", source.item)
