@@ -20,7 +20,7 @@ from mlbatch.simulate.robosense import encode as robosense
 from mlbatch.simulate.robosense.encode import RobosenseSpec
 from mlbatch.simulate.velodyne import encode as velodyne
 from mlbatch.simulate.velodyne.encode import VelodyneSpec
-from mlbatch.simulate.velodyne.models import calibration_yaml
+from mlbatch.simulate.velodyne.models import MODELS, calibration_yaml
 from mlbatch.types import ColumnHeaders, Stream
 from tests.builders.decoded import Readings, readings
 from tests.builders.lidar_packets import Spec, encoded, hesai_unit, shape
@@ -28,8 +28,8 @@ from tests.builders.others import rows
 
 STREAM = Stream("192.168.1.201", 2368)
 DIFOP = Stream("192.168.1.201", 7788)
-# Velodynes with a table of their own.
-PLAIN = ("VLP-16", "Puck Hi-Res", "HDL-32E", "VLP-32C", "VLS-128")
+# Velodynes with a table of their own; an HDL-64E has a file of its unit.
+PLAIN = tuple(model for model in MODELS if not model.startswith("HDL-64E"))
 MODES = ("strongest", "last", "dual")
 _HESAI_COLUMNS = 420
 # Packets lie in a wider buffer.
