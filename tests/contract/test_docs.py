@@ -19,6 +19,7 @@ from mlbatch.discovery.calibrations import MAX_CALIBRATION_FILE_BYTES
 from mlbatch.discovery.discover import SensorSelection
 from mlbatch.frames import urdf
 from mlbatch.lidar import limits as lidar_limits
+from mlbatch.options import BY_NAME
 from mlbatch.page.findings import REMEDIES
 from mlbatch.pipeline.job import Job
 from mlbatch.pipeline.run import convert
@@ -94,6 +95,7 @@ def test_layouts_are_described(name: str) -> None:
 def test_formats_are_described() -> None:
     titles = re.findall(r"^## (\w+)", _page("formats.md"), re.MULTILINE)
     assert {title.lower() for title in titles} >= set(format_names())
+    assert set(re.findall(r"\w+", BY_NAME["format"].about)) >= set(format_names())
 
 
 def test_every_container_is_named() -> None:
