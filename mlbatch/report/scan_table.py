@@ -6,6 +6,7 @@ import csv
 import io
 import math
 import tempfile
+import weakref
 from array import array
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -70,8 +71,9 @@ class ScanTable:
 
     def __init__(self, info: RunInfo, columns_per_s: Sequence[float | None] = ()) -> None:
         """columns_per_s: nominal rate of each sensor; None if unknown."""
-        # Deleted with this object; `text` gives the content.
+        # `text` gives the content.
         self._file = tempfile.SpooledTemporaryFile(_SPOOL_BYTES)  # noqa: SIM115
+        weakref.finalize(self, self._file.close)
         self._slices = info.slices
         # Of the last windows, not yet formatted; another scan may join the last of them.
         self._pending: list[_Row] = []
