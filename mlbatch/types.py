@@ -90,14 +90,14 @@ class StreamTable:
 
     def number(self, stream: Stream) -> int:
         """Number of `stream`, given at its first packet."""
-        found = self._numbers.get(stream)
-        if found is None:
+        number = self._numbers.get(stream)
+        if number is None:
             if self.is_full and stream != OTHER_STREAMS:
                 return self.number(OTHER_STREAMS)
-            found = len(self.streams)
-            self._numbers[stream] = found
+            number = len(self.streams)
+            self._numbers[stream] = number
             self.streams.append(stream)
-        return found
+        return number
 
     @property
     def is_full(self) -> bool:

@@ -59,8 +59,8 @@ class FillMeter:
         for number, (one, own_figures) in enumerate(zip(self._sensors, figures, strict=True)):
             count = own_figures.columns
             if one.learns and count:
-                own = np.flatnonzero(columns.sensor == number)
-                one.learn(columns.stamp_ns[own], columns.encoder[own])
+                rows = np.flatnonzero(columns.sensor == number)
+                one.learn(columns.stamp_ns[rows], columns.encoder[rows])
             fills.append(_fill(count, one.columns(length_ns)))
         return np.array(fills, np.float32)
 
@@ -113,10 +113,10 @@ class _Expectation:
 
     def columns(self, length_ns: int) -> float:
         """Columns that any window of this length has at least, without loss; NaN: unknown."""
-        found = self._columns.get(length_ns)
-        if found is None:
-            found = self._columns[length_ns] = self._computed(length_ns)
-        return found
+        expected = self._columns.get(length_ns)
+        if expected is None:
+            expected = self._columns[length_ns] = self._computed(length_ns)
+        return expected
 
     def _computed(self, length_ns: int) -> float:
         if not self.pace.columns_per_s:

@@ -220,8 +220,10 @@ class NearestSweeps:
         def distance_ns(sweep: Sweep) -> int:
             return abs(sweep.first_ns - leading.first_ns)
 
-        found = min(queue, key=distance_ns, default=None)
-        return found if found is not None and distance_ns(found) <= self._tolerance_ns else None
+        nearest = min(queue, key=distance_ns, default=None)
+        return (
+            nearest if nearest is not None and distance_ns(nearest) <= self._tolerance_ns else None
+        )
 
 
 class CollectedSweeps:

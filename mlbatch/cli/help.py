@@ -61,8 +61,8 @@ def _group(command: str, param: Any) -> str:
 
 def command_rows(group: Any, context: Any) -> Rows:
     """Name and summary of each command."""
-    found = [(name, group.get_command(context, name)) for name in group.list_commands(context)]
-    return [(name, one.get_short_help_str(limit=200)) for name, one in found if not one.hidden]
+    commands = [(name, group.get_command(context, name)) for name in group.list_commands(context)]
+    return [(name, one.get_short_help_str(limit=200)) for name, one in commands if not one.hidden]
 
 
 def is_drawn() -> bool:

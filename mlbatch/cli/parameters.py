@@ -91,12 +91,12 @@ def parameter(option: Option) -> inspect.Parameter:
 
 def with_parameters(command: Callable[..., None], added: Iterable[inspect.Parameter]) -> None:
     """Give a command parameters in place of its `**options`: the parser reads its signature."""
-    own = [
+    named = [
         one
         for one in inspect.signature(command, eval_str=True).parameters.values()
         if one.kind != one.VAR_KEYWORD
     ]
-    signature = inspect.Signature([*own, *added])
+    signature = inspect.Signature([*named, *added])
     command.__signature__ = signature  # type: ignore[attr-defined]
     command.__annotations__ = {name: one.annotation for name, one in signature.parameters.items()}
 

@@ -1,4 +1,4 @@
-"""Progress on stderr: a bar on a terminal; with -v one line a minute elsewhere."""
+"""Progress on stderr: a bar on a terminal; with -v one line per minute elsewhere."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ class Reporter:
         return (self._clock() - self._began_s) * (self.total - self.done) / self.done
 
     def amount(self) -> str:
-        """What is done, of all."""
+        """Amount done and total amount."""
         if self._unit != "MB":
             return f"{self.done}/{self.total or '?'} {self._unit}"
         text = f"{self.done / _BYTES_PER_MB:.1f}/{self.total / _BYTES_PER_MB:.1f} MB"
@@ -81,7 +81,7 @@ def duration(seconds: float) -> str:
 
 
 class Lines:
-    """Prints the line of a reporter once a minute."""
+    """Prints the line of a reporter once per minute."""
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         self._clock = clock

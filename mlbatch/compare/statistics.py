@@ -105,9 +105,9 @@ class SetReport:
 
     def as_json(self) -> dict[str, str | int | dict[str, float | None]]:
         """The policy in the JSON document."""
-        found = asdict(replace(self, series=None))
-        del found["series"]
-        return found
+        document = asdict(replace(self, series=None))
+        del document["series"]
+        return document
 
 
 class SetStatistics:

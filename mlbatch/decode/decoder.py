@@ -154,11 +154,11 @@ class Decoder:
 
     def _written(self) -> list[int]:
         """Return the points so far of each sensor of the run; 0 without a decoder here."""
-        own = [one.written for one in self._counts]
+        points = [one.written for one in self._counts]
         if self._only is None:
-            return own
+            return points
         others = [0] * (len(self._info.sensors) - 1)
-        return [*others[: self._only], *own, *others[self._only :]]
+        return [*others[: self._only], *points, *others[self._only :]]
 
     def _scan(
         self, columns: WindowColumns, header: ScanHeader, points: int, before: Sequence[int]

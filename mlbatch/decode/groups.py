@@ -92,10 +92,10 @@ class SensorGroup:
 
     def mirror_angles(self, angle_rad: F64Array) -> F32Array:
         """Return cosine and sine (2, n) of twice the angle past the start of the mirror, (n,)."""
-        own = geometry(self._sources[0])
-        if not isinstance(own, Mirrors):
+        mirrors = geometry(self._sources[0])
+        if not isinstance(mirrors, Mirrors):
             raise TypeError(f"{self._lidar.model} has no mirrors")
-        past = np.minimum.reduce([(angle_rad - start) % _REVOLUTION for start in own.start_rad])
+        past = np.minimum.reduce([(angle_rad - start) % _REVOLUTION for start in mirrors.start_rad])
         return np.stack([np.cos(2 * past), np.sin(2 * past)]).astype(np.float32)
 
     def use_rings(self) -> None:
@@ -319,8 +319,8 @@ class SensorGroup:
 
 def geometry(source: Source) -> Geometry:
     """Return the beams of a sensor in the body frame, or what it has instead."""
-    own = source.lidar.projection(source.body_from_sensor)
-    return source.lidar.beams.moved(source.body_from_sensor) if own is None else own
+    projection = source.lidar.projection(source.body_from_sensor)
+    return source.lidar.beams.moved(source.body_from_sensor) if projection is None else projection
 
 
 def group_key(source: Source, number: int) -> Hashable:
@@ -474,8 +474,8 @@ def _used_by_table(vectors: F32Array, origin: F32Array) -> I64Array:
     """
     if bool((np.signbit(origin) & (origin == 0)).any()):
         return np.full(len(vectors), _ALL_DIRECTIONS)
-    own = [_nonzero_axes(one[:2]) | _nonzero_axes(one[2:]) << 3 for one in vectors]
-    return np.array(own, np.int64)
+    bits = [_nonzero_axes(one[:2]) | _nonzero_axes(one[2:]) << 3 for one in vectors]
+    return np.array(bits, np.int64)
 
 
 def _nonzero_axes(vectors: F32Array) -> int:

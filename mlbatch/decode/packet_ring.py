@@ -50,8 +50,8 @@ class PacketRing:
     def column_offsets(self, columns: int) -> I64Array:
         """Return the ring indexes of the columns of a packet, relative to the first: (columns,)."""
         if columns != len(self._offsets):
-            row, place = np.divmod(np.arange(columns), self._records.per_row)
-            self._offsets = np.asarray(row * self._records.stride + place * self._records.step)
+            row, position = np.divmod(np.arange(columns), self._records.per_row)
+            self._offsets = np.asarray(row * self._records.stride + position * self._records.step)
             self._offsets.flags.writeable = False
         return self._offsets
 
@@ -99,9 +99,9 @@ class PacketRing:
         sums = np.cumsum(each, dtype=np.uint64) + self._sum
         self._sum = sums[-1]
         is_needed = self._places >= self._arena.oldest - self._size
-        known = np.concatenate([self._places[is_needed], places])
-        order = known.argsort()
-        self._places = known[order]
+        indexes = np.concatenate([self._places[is_needed], places])
+        order = indexes.argsort()
+        self._places = indexes[order]
         self._sums = np.concatenate([self._sums[is_needed], sums])[order]
 
     def _viewed(self) -> tuple[npt.NDArray[np.void], int, U8Array]:

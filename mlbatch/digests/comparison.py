@@ -71,11 +71,11 @@ def compare(expected: dict[str, Json], found: dict[str, Json]) -> Comparison:
 def _by_window(golden: dict[str, Json]) -> dict[str, dict[str, Json]]:
     """The scans by their names."""
     scans = golden.get("scans")
-    found: dict[str, dict[str, Json]] = {}
+    by_name: dict[str, dict[str, Json]] = {}
     for scan in scans if isinstance(scans, list) else ():
         if isinstance(scan, dict):
-            found[scan_name(scan.get("index"), scan.get("slice"), scan.get("sensor"))] = scan
-    return found
+            by_name[scan_name(scan.get("index"), scan.get("slice"), scan.get("sensor"))] = scan
+    return by_name
 
 
 def scan_name(index: Json, part: Json, sensor: Json) -> str:

@@ -1,4 +1,4 @@
-"""A golden file: scans and the run of an output in JSON, a line a scan, without paths and times."""
+"""A golden file: scans and run of an output in JSON, one line per scan, without paths and times."""
 
 from __future__ import annotations
 
@@ -133,11 +133,11 @@ def describe_run(where: object, text: str | None) -> dict[str, Json]:
 
 
 def _sensor(report: dict[str, Json]) -> dict[str, Json]:
-    found = _chosen(report, _SENSOR)
+    sensor = _chosen(report, _SENSOR)
     extrinsics = report["extrinsics"]
     if isinstance(extrinsics, dict):
-        found["body_from_sensor"] = extrinsics.get("body_from_sensor")
-    return found
+        sensor["body_from_sensor"] = extrinsics.get("body_from_sensor")
+    return sensor
 
 
 def _chosen(values: dict[str, Json], keys: tuple[str, ...]) -> dict[str, Json]:
@@ -180,16 +180,16 @@ def values(array: npt.NDArray[Any]) -> Json:
     if array.ndim:
         return [values(one) for one in array]
     if array.dtype.kind != "f":
-        found: int = array.item()
-        return found
+        number: int = array.item()
+        return number
     return _real(float(str(array[()])))
 
 
 def mean(array: npt.NDArray[Any]) -> Json:
     """Means over the first axis, rounded."""
-    found = np.mean(array, axis=0, dtype=np.float64)
-    rounded = [_real(float(f"{one:.{_MEAN_DIGITS}g}")) for one in np.atleast_1d(found)]
-    return rounded[0] if found.ndim == 0 else list(rounded)
+    means = np.mean(array, axis=0, dtype=np.float64)
+    rounded = [_real(float(f"{one:.{_MEAN_DIGITS}g}")) for one in np.atleast_1d(means)]
+    return rounded[0] if means.ndim == 0 else list(rounded)
 
 
 def _real(value: float) -> float | None:

@@ -99,8 +99,10 @@ class Ignored(NamedTuple):
     @property
     def serials(self) -> tuple[str, ...]:
         """Words that are no sensors, hence serial numbers of other lidars, or addresses."""
-        known = {word for one in self.sensors for word in (one.name, one.lidar.serial)}
-        return tuple(word for word in self.words if word not in known and not _is_address(word))
+        sensor_words = {word for one in self.sensors for word in (one.name, one.lidar.serial)}
+        return tuple(
+            word for word in self.words if word not in sensor_words and not _is_address(word)
+        )
 
     def names(self, stream: Stream, what: str | None) -> bool:
         """Return whether --ignore names a stream, or the serial number in its description."""
@@ -295,8 +297,8 @@ def lacks_decoder(what: str) -> bool:
 
 
 def _is_lidar(sampler: Sampler, kind: PacketKind) -> bool:
-    what = describe(sampler, kind)
-    return what is not None and "lidar" in what
+    description = describe(sampler, kind)
+    return description is not None and "lidar" in description
 
 
 # -- sensors of the rig ---------------------------------------------------------------------------
@@ -373,8 +375,8 @@ def _built_in(sent_by: Collection[str], sensor: RigSensor) -> tuple[Calibration,
     More than one, else all: a sensor that sent no packet is decided by how many there are.
     """
     named = () if sensor.model is None else sensors.vendor_of(sensor.model)
-    found = sensors.built_in({*sent_by, *named})
-    return found if len(found) > 1 else sensors.built_in()
+    calibrations = sensors.built_in({*sent_by, *named})
+    return calibrations if len(calibrations) > 1 else sensors.built_in()
 
 
 def _refuse_undecodable(sampler: Sampler, sensor: RigSensor, origin: Path) -> None:

@@ -126,9 +126,9 @@ class _Packets(NamedTuple):
 
     def follows(self, one: I64Array, other: I64Array) -> BoolArray:
         """(n,) True where one of two packets is the other's next, whatever their timestamps."""
-        known = (self.number[one] >= 0) & (self.number[other] >= 0)
+        are_numbered = (self.number[one] >= 0) & (self.number[other] >= 0)
         apart = np.abs(self.number[other] - self.number[one])
-        result = np.where(known, apart == 1, bool(self.turn))
+        result = np.where(are_numbered, apart == 1, bool(self.turn))
         if self.turn:
             result &= self._turns_on(one, other) | self._turns_on(other, one)
         return np.asarray(result, np.bool_)
@@ -141,7 +141,7 @@ class _Packets(NamedTuple):
 
 
 def _packets(sampler: Sampler, kind: PacketKind, lidar: Lidar) -> _Packets:
-    """The intact samples of a kind, all of whose columns are valid."""
+    """Return the intact samples of a kind in which all columns are valid."""
     payloads, host_ns, position = sampler.numbered_samples(kind, lidar)
     headers = lidar.column_headers(payloads, host_ns)
     whole = headers.valid.all(axis=1)

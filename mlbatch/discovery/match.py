@@ -421,8 +421,11 @@ def describe(sampler: Sampler, kind: PacketKind) -> str | None:
 def describe_each(size: int, packets: U8Array) -> str | None:
     """Description of packets (k, size) one by one: a lidar's, since a damaged one may be first."""
     texts = [sensors.describe(size, packet[None]) for packet in packets]
-    known = [text for text in texts if text]
-    return next((text for text in known if "lidar" in text), known[0] if known else None)
+    descriptions = [text for text in texts if text]
+    return next(
+        (text for text in descriptions if "lidar" in text),
+        descriptions[0] if descriptions else None,
+    )
 
 
 def release(sampler: Sampler, kinds: Iterable[PacketKind]) -> None:
@@ -526,24 +529,24 @@ def _refuse_other_lidars(
 def _own_calibrations(expected: ExpectedSensor, used: Collection[str]) -> list[Calibration]:
     """Calibrations a silent sensor may have: unused files, else the built-in one of its model."""
     usable = expected.usable()
-    own = [one for one in usable if one.path is not None]
+    unused = [one for one in usable if one.path is not None]
     if len(expected.calibrations) > 1:
-        own = [one for one in own if str(one.path) not in used]
+        unused = [one for one in unused if str(one.path) not in used]
     if expected.rig.model is None:
-        return own
+        return unused
     named = [one for one in usable if one.model == expected.rig.model]
-    return [one for one in named if one.path is not None] or named or own
+    return [one for one in named if one.path is not None] or named or unused
 
 
 def lidars_on(sampler: Sampler, selector: StreamSelector, kinds: Sequence[PacketKind]) -> str:
     """Descriptions of the lidars among the kinds that a selector selects, or ""."""
-    found = []
+    lidars = []
     for kind in kinds:
         stream = sampler.table.streams[kind.stream]
         what = describe(sampler, kind) if selector.selects(stream) else None
         if what is not None and "lidar" in what:
-            found.append(f"{what} ({stream})")
-    return ", ".join(found)
+            lidars.append(f"{what} ({stream})")
+    return ", ".join(lidars)
 
 
 def _paths(calibrations: Sequence[Calibration]) -> str:

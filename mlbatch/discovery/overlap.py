@@ -309,9 +309,9 @@ def _lidars(
     for kind, index in KindFilter().followed(batch, split_by_kind(batch)):
         stream = table.streams[kind.stream]
         packets = batch.data[batch.start[index[:_CHECKED], None] + np.arange(kind.size)]
-        what = sensors.describe(kind.size, packets)
-        if what is not None and "lidar" in what and is_wanted(stream, what):
-            yield lidar_name(stream, what)
+        description = sensors.describe(kind.size, packets)
+        if description is not None and "lidar" in description and is_wanted(stream, description):
+            yield lidar_name(stream, description)
 
 
 def lidar_name(stream: Stream, what: str) -> str:

@@ -54,13 +54,13 @@ class Router:
 
     def route(self, kind: PacketKind, payload: U8Array) -> Route:
         """Route of a kind; payload: one of its packets, read for the first of a kind only."""
-        known = self._routes.get(kind)
-        if known is None:
-            known = self._decide(kind, payload)
-            if known == _UNASSIGNED and len(self._routes) >= _MOST_ROUTES:
+        route = self._routes.get(kind)
+        if route is None:
+            route = self._decide(kind, payload)
+            if route == _UNASSIGNED and len(self._routes) >= _MOST_ROUTES:
                 self._forget_unassigned()
-            self._routes[kind] = known
-        return known
+            self._routes[kind] = route
+        return route
 
     def _forget_unassigned(self) -> None:
         """Let kinds of no sensor be decided again, by their next packets."""

@@ -232,8 +232,8 @@ class Sampler:
 
     def first_host_ns(self, sensor: DetectedSensor) -> int | None:
         """Receive time of the first packet of a sensor; None if it sent none."""
-        known = sensor.kinds & self.kinds.keys()
-        return min((self.kinds[kind].first_host_ns for kind in known), default=None)
+        sampled = sensor.kinds & self.kinds.keys()
+        return min((self.kinds[kind].first_host_ns for kind in sampled), default=None)
 
     def has_receive_times(self, sensor: DetectedSensor) -> bool:
         """True if the packets of a sensor have receive times of their own; see `StreamTable`."""

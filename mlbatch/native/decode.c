@@ -686,7 +686,7 @@ static const int64_t *labels_of(const Group *group, int64_t known, Planes *plane
 /* A point: x, y, z, level. */
 typedef float Point __attribute__((vector_size(16)));
 
-/* Numbers from the first, or the second half of each four of two vectors by turns; by pairs. */
+/* Interleave numbers of two vectors, from the first or the second half of each four; by pairs. */
 #if LANES == 8
 #define FIRST(a, b) SHUFFLE(Ints, a, b, 0, 8, 1, 9, 4, 12, 5, 13)
 #define SECOND(a, b) SHUFFLE(Ints, a, b, 2, 10, 3, 11, 6, 14, 7, 15)

@@ -19,7 +19,7 @@ Values: TypeAlias = npt.NDArray[np.generic]
 
 
 def commented_limits(name: str) -> dict[str, str]:
-    """What files of a format with comments and points cannot show."""
+    """Reasons why checks are not possible on files of a format with comments and points."""
     absent = {
         "geometry": "ranges",
         "duplicates": "columns",

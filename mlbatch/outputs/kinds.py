@@ -1,4 +1,4 @@
-"""What a path is: an output in one file, in a folder of a format, or none.
+"""Kind of a path: an output in one file, in a folder of a format, or none.
 
 Libraries of a format are loaded only for outputs of that format.
 """

@@ -62,7 +62,7 @@ class Place:
 
 
 class RecordListener:
-    """Hears of every record that `McapFile` reads; ignores it."""
+    """Gets every record that `McapFile` reads. This base class ignores them."""
 
     def record(self, place: Place, record: McapRecord) -> None:
         """A header, metadata, attachment, chunk or message index."""
@@ -74,7 +74,7 @@ class RecordListener:
         """A record in a chunk; where: name of a message."""
 
     def chunk_end(self, where: str, chunk: Chunk) -> None:
-        """The end of a chunk, all of whose records were read."""
+        """The end of a chunk; all its records were read."""
 
     def indexes_end(self) -> None:
         """The end of the message indexes after a chunk."""

@@ -146,8 +146,8 @@ def check_messages(topic: str, read: int, written: int, dropped: dict[str, int])
 
 def ordered(counts: dict[str, int], reasons: tuple[str, ...]) -> dict[str, int]:
     """The counted reasons, in the order of their closed list."""
-    known = {reason: counts[reason] for reason in reasons if counts.get(reason)}
-    return known | {reason: count for reason, count in sorted(counts.items()) if count}
+    listed = {reason: counts[reason] for reason in reasons if counts.get(reason)}
+    return listed | {reason: count for reason, count in sorted(counts.items()) if count}
 
 
 def _add(counts: dict[str, int], reason: str, count: int) -> None:

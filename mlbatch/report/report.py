@@ -214,11 +214,11 @@ def _section(value: object) -> dict[str, Any]:
 
 def _fields(sensor: object) -> dict[str, Any]:
     """The fields of a `SensorReport` in the JSON of a sensor."""
-    found = _section(sensor)
-    extrinsics = _section(found.get("extrinsics"))
+    section = _section(sensor)
+    extrinsics = _section(section.get("extrinsics"))
     return {
-        **found,
-        "ledger": found,
+        **section,
+        "ledger": section,
         "extrinsics_source": extrinsics.get("source"),
         "body_from_sensor": extrinsics.get("body_from_sensor"),
     }
@@ -393,8 +393,8 @@ def _sensor(sensor: SensorReport) -> Section:
 
 def _decoded(counts: DecodedCounts, reasons: tuple[str, ...]) -> Section:
     """Columns or IMU samples; without `reused` where nothing is."""
-    found = asdict(counts) | {"dropped": ordered(counts.dropped, reasons)}
-    return {key: value for key, value in found.items() if value or key != "reused"}
+    section = asdict(counts) | {"dropped": ordered(counts.dropped, reasons)}
+    return {key: value for key, value in section.items() if value or key != "reused"}
 
 
 def _summary_row(sensor: SensorReport) -> tuple[str, ...]:

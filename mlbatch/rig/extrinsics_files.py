@@ -62,11 +62,11 @@ class ExtrinsicsFiles:
         """Return (4, 4) body_from_sensor, m; RigError names file, key, expected and found."""
         roots = [_read(file, self.node, by_key=bool(self.keys)) for file in self.files]
         if self.keys:
-            found = _product(roots, self.keys, self.node, self.unit)
-            found = inverse(found) if self.direction == SENSOR_FROM_BODY else found
+            pose = _product(roots, self.keys, self.node, self.unit)
+            pose = inverse(pose) if self.direction == SENSOR_FROM_BODY else pose
         else:
-            found = self._chain(roots, clean(self.parent or body_frame), serial)
-        return found if self.sensor_in_frame is None else compose(found, self.sensor_in_frame)
+            pose = self._chain(roots, clean(self.parent or body_frame), serial)
+        return pose if self.sensor_in_frame is None else compose(pose, self.sensor_in_frame)
 
     def _chain(self, roots: Sequence[Node], parent: str, serial: str) -> F64Array:
         """The pose of a frame of the files."""
@@ -350,9 +350,9 @@ def _below(node: Node, key: str) -> Node | None:
         return node.entries[key]
     for name, child in node.entries.items():
         if key.startswith(f"{name}."):
-            found = _below(child, key[len(name) + 1 :])
-            if found is not None:
-                return found
+            value = _below(child, key[len(name) + 1 :])
+            if value is not None:
+                return value
     return None
 
 

@@ -102,10 +102,10 @@ class Node(NamedTuple):
     def entry(self, key: str) -> Node:
         """Return the value of a key that a mapping must have; other keys do not matter."""
         if key not in self.entries:
-            found = self.shown
+            content = self.shown
             if self.kind == "mapping":
-                found = f"keys {', '.join(self.entries) or 'none'}"
-            raise self.error(f"the key {key}", found, "correct the file")
+                content = f"keys {', '.join(self.entries) or 'none'}"
+            raise self.error(f"the key {key}", content, "correct the file")
         return self.entries[key]
 
     def elements(self, what: str) -> tuple[Node, ...]:

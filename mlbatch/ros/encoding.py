@@ -132,10 +132,10 @@ class MessageReader(Cursor):
 
     def fields(self, name: str) -> tuple[Field, ...]:
         """Fields of a type; MessageError if it is not defined."""
-        found = self.types.get(name)
-        if found is None:
+        fields = self.types.get(name)
+        if fields is None:
             raise MessageError(f"expected the definition of {name}, found none; record it again")
-        return found
+        return fields
 
     def count(self, field: Field) -> int:
         """Number of elements of an array."""

@@ -25,8 +25,8 @@ def decode_string(topic: Topic, data: bytes) -> str:
 
 def decode_bytes(topic: Topic, data: bytes) -> bytes:
     """The bytes of a std_msgs/UInt8MultiArray."""
-    found = _leaves(topic, data).get("data", b"")
-    return found if isinstance(found, bytes) else b""
+    leaf = _leaves(topic, data).get("data", b"")
+    return leaf if isinstance(leaf, bytes) else b""
 
 
 def decode_transforms(topic: Topic, data: bytes) -> list[Transform]:

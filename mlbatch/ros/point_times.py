@@ -212,30 +212,30 @@ def _float_ns(value: npt.NDArray[np.float64], unit_ns: int) -> I64Array:
 def _reading(kind: np.dtype[Any], high: float, zero: Zero, rule: PointRule) -> Reading:
     """Unit and zero of times: by the rule, else by convention."""
     unit_ns = rule.unit_ns
-    found = _by_unit(high, unit_ns) if unit_ns else _conventional(kind, high, zero)
-    return Reading(found.unit_ns, rule.origin == ABSOLUTE) if rule.origin else found
+    reading = _by_unit(high, unit_ns) if unit_ns else _conventional(kind, high, zero)
+    return Reading(reading.unit_ns, rule.origin == ABSOLUTE) if rule.origin else reading
 
 
 def _conventional(kind: np.dtype[Any], high: float, zero: Zero) -> Reading:
     """Unit and zero of times by convention; CloudError if there is none."""
-    found = convention(kind, high)
-    if found is None:
+    reading = convention(kind, high)
+    if reading is None:
         raise CloudError(
             f"field {zero.field}: expected s after {zero.base} (below 1000), or float64 s or ns "
             f"since 1970, found {high:g}; give its unit in the rig (points: {{unit: us}}), or "
             "record the raw packets"
         )
-    return found
+    return reading
 
 
 def convention(kind: np.dtype[Any], high: float) -> Reading | None:
     """Unit and origin that drivers use for times of a type up to `high`; None if unknown."""
     if kind.kind != "f":
         return Reading(1, is_absolute=False)
-    found = next((one.reading for one in _FLOAT_TIMES if one.above < high < one.below), None)
-    if found is not None and found.is_absolute and kind.itemsize < _FLOAT64_BYTES:
+    reading = next((one.reading for one in _FLOAT_TIMES if one.above < high < one.below), None)
+    if reading is not None and reading.is_absolute and kind.itemsize < _FLOAT64_BYTES:
         return None
-    return found
+    return reading
 
 
 def _by_unit(high: float, unit_ns: int) -> Reading:
@@ -373,10 +373,10 @@ def ahead_ns(samples: Sequence[CloudSample], rule: PointRule) -> int | None:
 
     None where that is unknown: log times that are copies of the header's, or unreadable times.
     """
-    known = [one for one in samples if one.points]
-    if not known or _are_copies(known):
+    with_points = [one for one in samples if one.points]
+    if not with_points or _are_copies(with_points):
         return None
-    lasts = [(_last_stamp_ns(one, rule), one.host_ns) for one in known]
+    lasts = [(_last_stamp_ns(one, rule), one.host_ns) for one in with_points]
     return max((last - host_ns for last, host_ns in lasts if last is not None), default=None)
 
 

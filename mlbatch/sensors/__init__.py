@@ -151,11 +151,11 @@ def read_calibration(path: Path) -> Calibration | None:
 def parse_calibration(origin: Path, content: bytes) -> Calibration | None:
     """Parse a calibration from a file or a topic (`origin`); None if it is none."""
     vendors = [name for name in _names() if _vendor(name).may_calibrate(content)]
-    found = (plugin.read_calibration(origin, content) for plugin in _load_lazily(vendors))
-    return next((calibration for calibration in found if calibration is not None), None)
+    calibrations = (plugin.read_calibration(origin, content) for plugin in _load_lazily(vendors))
+    return next((calibration for calibration in calibrations if calibration is not None), None)
 
 
 def describe(size: int, sample: U8Array) -> str | None:
     """Name payloads (k, size) of an unknown stream; None if no vendor knows them."""
-    found = (plugin.describe(size, sample) for plugin in _load_lazily(senders(size, sample)))
-    return next((text for text in found if text is not None), None)
+    texts = (plugin.describe(size, sample) for plugin in _load_lazily(senders(size, sample)))
+    return next((text for text in texts if text is not None), None)

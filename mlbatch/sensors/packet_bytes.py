@@ -63,8 +63,8 @@ def majority(packets: U8Array, good: BoolArray) -> U8Array | None:
 
 def most_common(values: I64Array) -> int:
     """The most frequent value."""
-    found, counts = np.unique(values, return_counts=True)
-    return int(found[counts.argmax()])
+    distinct, counts = np.unique(values, return_counts=True)
+    return int(distinct[counts.argmax()])
 
 
 def block_azimuths(packets: U8Array, begin: int, stride: int, count: int, order: Order) -> I64Array:

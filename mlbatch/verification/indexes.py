@@ -39,7 +39,7 @@ Index: TypeAlias = dict[int, list[tuple[int, int]]]
 
 @dataclass(slots=True)
 class _ChunkFound:
-    """What was read of one chunk and of its message indexes."""
+    """Data read from one chunk and its message indexes."""
 
     place: Place
     compression: str
@@ -221,7 +221,7 @@ class McapIndexChecks(RecordListener):
 
 
 class BagFile(NamedTuple):
-    """What was found in one MCAP file: messages, first and last log time."""
+    """Content of one MCAP file: messages, first and last log time."""
 
     name: str
     messages: int

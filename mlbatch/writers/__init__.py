@@ -194,9 +194,9 @@ def extras(name: str, options: WriterOptions) -> frozenset[str]:
 
 def record_layout(name: str, options: WriterOptions) -> RecordLayout | None:
     """Return the records that a writer takes packed, see `WriterModule`; None: arrays."""
-    own: Callable[[WriterOptions], RecordLayout | None] | None
-    own = getattr(plugin(name), "record_layout", None)
-    return None if own is None else own(options)
+    layout_of: Callable[[WriterOptions], RecordLayout | None] | None
+    layout_of = getattr(plugin(name), "record_layout", None)
+    return None if layout_of is None else layout_of(options)
 
 
 def has_several_files(name: str, options: WriterOptions) -> bool:

@@ -133,12 +133,12 @@ def _quoted(text: str) -> str:
 
 def _all_topics(files: Iterable[BagFile]) -> Iterable[BagTopic]:
     """Return each topic once, with its messages in all files, as they appear first."""
-    found: dict[str, BagTopic] = {}
+    by_name: dict[str, BagTopic] = {}
     for topic in (topic for file in files for topic in file.topics):
-        before = found.get(topic.name)
+        before = by_name.get(topic.name)
         count = topic.messages + (0 if before is None else before.messages)
-        found[topic.name] = (before or topic)._replace(messages=count)
-    return found.values()
+        by_name[topic.name] = (before or topic)._replace(messages=count)
+    return by_name.values()
 
 
 def _text_of_file(file: BagFile) -> str:

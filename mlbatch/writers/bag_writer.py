@@ -34,8 +34,8 @@ _NAME = re.compile(r".*_(\d+)\.mcap", re.ASCII | re.DOTALL)
 
 def number_of_file(name: str) -> int | None:
     """Return the number of a file of a bag; None for another name."""
-    found = _NAME.fullmatch(name)
-    return None if found is None else int(found[1])
+    match = _NAME.fullmatch(name)
+    return None if match is None else int(match[1])
 
 
 def name_of_file(stem: str, number: int) -> str:

@@ -223,8 +223,8 @@ def _is_on(options: Mapping[str, str], key: str, default: str = "off") -> bool:
 
 
 def _layout(evidence: Evidence) -> Layout | None:
-    found = identify(evidence.size, evidence.sample) if len(evidence.sample) else None
-    return None if found is None else found.layout
+    identity = identify(evidence.size, evidence.sample) if len(evidence.sample) else None
+    return None if identity is None else identity.layout
 
 
 def _require_layout(path: Path | None, evidence: Evidence | None) -> Layout:

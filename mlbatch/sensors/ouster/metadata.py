@@ -111,8 +111,8 @@ class Document(NamedTuple):
     def refuse_metres(self, key: str, length_mm: float) -> None:
         """Refuse a length of less than 1 mm that is not 0: no part is so near another."""
         if 0 < abs(length_mm) < 1:
-            found = f"{length_mm:.4g} mm, {length_mm * MM_PER_M:.4g} mm if the file has metres"
-            self.fail(key, "millimetres", found)
+            shown = f"{length_mm:.4g} mm, {length_mm * MM_PER_M:.4g} mm if the file has metres"
+            self.fail(key, "millimetres", shown)
 
     def pose(self, key: str, most: float, unit: str) -> F64Array | None:
         """A rigid (4, 4) transform; None if absent. most: longest plausible translation."""

@@ -112,8 +112,12 @@ def seen_in(described: Metadata, headers: Headers, packets: U8Array, found: Colu
 
 def _columns_by_encoder(encoder: I64Array, mid: I64Array) -> float:
     """Columns of a revolution by the rotor positions that LEGACY columns state."""
-    known = (encoder > 0) & (mid > 0)
-    return float(median(mid[known] * ENCODER_TICKS / encoder[known])) if known.any() else 0.0
+    is_stated = (encoder > 0) & (mid > 0)
+    return (
+        float(median(mid[is_stated] * ENCODER_TICKS / encoder[is_stated]))
+        if is_stated.any()
+        else 0.0
+    )
 
 
 def _columns_by_frames(

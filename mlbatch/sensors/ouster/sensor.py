@@ -141,14 +141,14 @@ class OusterCalibration:
 
     def _seen(self, packets: U8Array) -> Seen:
         """Mode of the unit by its intact packets."""
-        found = self._reader.read_rows(packets).columns
-        return seen_in(self.metadata, self._headers, packets, found)
+        columns = self._reader.read_rows(packets).columns
+        return seen_in(self.metadata, self._headers, packets, columns)
 
     def _good(self, evidence: Evidence) -> U8Array:
         """Intact packets of the unit."""
         packets = evidence.sample[:, : self.metadata.layout.packet_size]
-        found = self._reader.read_rows(packets)
-        return rows_of(packets, (found.faults == 0) & found.is_mine)
+        headers = self._reader.read_rows(packets)
+        return rows_of(packets, (headers.faults == 0) & headers.is_mine)
 
     def _other_init_id(self, packets: U8Array) -> Iterator[str]:
         """A note if packets carry another initialization id than the metadata."""

@@ -275,8 +275,8 @@ def firing_ns(points: U8Array, row: Model, difop: Difop | None) -> I64Array:
         chosen = difop.installation
     elif row is RUBY_PLUS_80 and len(points):
         chosen = int(ruby_type(points)[1] == _PLUS_80V)
-    known = row.firing_ns[chosen] if chosen < len(row.firing_ns) else row.firing_ns[0]
-    return np.array([known], np.int64) - min(known)
+    times_ns = row.firing_ns[chosen] if chosen < len(row.firing_ns) else row.firing_ns[0]
+    return np.array([times_ns], np.int64) - min(times_ns)
 
 
 def is_counted(points: U8Array, row: Model) -> bool:

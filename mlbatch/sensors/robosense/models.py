@@ -13,11 +13,11 @@ from dataclasses import dataclass, replace
 
 def _ns(times_us: str) -> tuple[int, ...]:
     """Times in us as ns; `t*n`: n channels fire at t."""
-    found: list[int] = []
+    times_ns: list[int] = []
     for text in times_us.split():
         time, _, count = text.partition("*")
-        found += [round(float(time) * 1000)] * int(count or 1)
-    return tuple(found)
+        times_ns += [round(float(time) * 1000)] * int(count or 1)
+    return tuple(times_ns)
 
 
 def _each(times_us: str, channels: int) -> tuple[int, ...]:

@@ -199,8 +199,8 @@ class CsvCalibration:
     def _row(self, evidence: Evidence) -> Model | None:
         if self._named is not None:
             return self._named if DifopCalibration(self._named).match_score(evidence) else None
-        found = identify_unit(evidence)
-        return None if found is None else next(iter(self._fitting(found)), None)
+        identity = identify_unit(evidence)
+        return None if identity is None else next(iter(self._fitting(identity)), None)
 
     def _fitting(self, found: Identity) -> list[Model]:
         """Models that packets may be of, with a channel for each line of the file."""

@@ -56,8 +56,8 @@ def format_of_files(suffix: str) -> str | None:
 
 def file_suffixes(name: str) -> tuple[str, ...]:
     """Return the suffixes of the files of a scan, without a dot, unless it is the format's name."""
-    found: tuple[str, ...] = getattr(format_module(name), "FILE_SUFFIXES", ())
-    return found
+    suffixes: tuple[str, ...] = getattr(format_module(name), "FILE_SUFFIXES", ())
+    return suffixes
 
 
 def format_module(name: str) -> WriterModule:
