@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
 @documented(SessionOptions)
 def open(*recordings: Paths, **options: Unpack[SessionOptions]) -> Recording:
-    """Open the recordings of one session; options are those of `mlbatch convert`.
+    """Open the recordings of one session; options are as for `mlbatch convert`.
 
     The first 10 s are read. Raises MlbatchError where the recording cannot be converted at all;
     unknown extrinsics are an error of `Recording.scans` only.
@@ -46,7 +46,7 @@ def open(*recordings: Paths, **options: Unpack[SessionOptions]) -> Recording:
 def scans(*recordings: Paths, **options: Unpack[ScanOptions]) -> Iterator[Scan]:
     """Yield the merged scans of one session, each with arrays of its own.
 
-    Options are those of `mlbatch convert` (max_wait in s, ranges in m, rate in Hz); fields
+    Options are as for `mlbatch convert` (max_wait in s, ranges in m, rate in Hz); fields
     of a Scan are named as the npz keys. Raises MlbatchError where the command ends with an error;
     what the first 10 s show is raised at the call.
     """

@@ -436,7 +436,7 @@ CONVERT: Final = (
     ),
 )
 BY_NAME: Final = {option.name: option for option in CONVERT}
-# Those that a batch passes on; the others are its own, or have no meaning for many sessions.
+# Options that a batch passes on; it has the others itself, or they suit one session only.
 _NOT_PASSED = (
     *("output", "rig", "jobs", "only", "overwrite", "resume", "quiet", "verbose"),
     *("report", "html", "dry_run", "shard"),

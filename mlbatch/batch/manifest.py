@@ -71,7 +71,7 @@ def sessions_of(
 ) -> tuple[Session, ...]:
     """The sessions of manifests and patterns in their order.
 
-    given: by the command line; its options replace those of a manifest. say: gets a line for each
+    given: by the command line; its options override a manifest. say: gets a line for each
     pattern that matches files that are no recordings, which are left out. Raises UsageError and
     RigError for mistakes, also where a pattern matches nothing.
     """
@@ -148,7 +148,7 @@ def _may_be_recording(match: str) -> bool:
 
 
 def _inputs(match: str, rig_name: str | None) -> tuple[str, ...]:
-    """The recordings of a match: itself, or those of a folder; none: it has none."""
+    """Recordings of a match: itself, or the recordings in a folder; empty if there are none."""
     if is_url(match):
         if not match.endswith("/"):
             return (match,)
@@ -258,7 +258,7 @@ def _option(node: Node, option: options.Option) -> Option | None:
 
 
 def _joined(*several: Mapping[str, Option | None]) -> tuple[Option, ...]:
-    """Options; later ones replace those of the same name."""
+    """Merge options; later ones replace earlier ones of the same name."""
     found = {name: option for options in several for name, option in options.items()}
     return tuple(option for option in found.values() if option is not None)
 

@@ -18,7 +18,7 @@ FAILED = "failed"
 
 @dataclass(slots=True)
 class SessionRecord:
-    """How a session ended; counts are those of its reports."""
+    """Outcome of a session; counts are from its reports."""
 
     name: str
     state: str  # done or failed

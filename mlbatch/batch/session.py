@@ -68,7 +68,7 @@ class Session:
         return [text for text in (*self.inputs, self.rig or "") if is_url(text)]
 
     def values(self, name: str, rig: Rig | None = None) -> tuple[str, ...]:
-        """Values of an option of `convert`: those given, else those that the rig keeps."""
+        """Values of an option of `convert`: as given, else from the rig."""
         kept = {one.name: one.values for one in rig.options} if rig is not None else {}
         given = {one.name.removeprefix("--"): one.values for one in self.options}
         return (kept | given).get(name, ())

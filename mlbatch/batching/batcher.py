@@ -1,7 +1,7 @@
 """The strategy of Faitli et al. (2025), section 2.1, on batches of packets instead of columns.
 
 The paper takes the smallest waiting stamp of all sensors, converts that column, advances. Here the
-columns of a batch wait as small records, and a stable sort by stamp merges those of closed windows.
+columns of a batch wait as small records, and a stable sort by stamp merges closed windows.
 `reference.py` implements the same rules in plain loops; tests compare both.
 
 Terms of event-time stream processing:
@@ -229,7 +229,7 @@ class Batcher:
             raise ClockJump(str(first), min([first.host_ns, *near_ns]))
 
     def _check_clocks(self, accepted: Sequence[Accepted | None], ranks: Sequence[I64Array]) -> None:
-        """Record first stamps; ClockError if those of two sensors are not comparable."""
+        """Record first stamps; ClockError if two sensors are not comparable."""
         firsts = []
         for number, (track, one) in enumerate(zip(self._tracks, accepted, strict=True)):
             if one is None or track.first_ns > NEVER:

@@ -126,7 +126,7 @@ class SweepFusion:
         return ended
 
     def _forget(self, oldest_ns: int) -> None:
-        """Release sweeps that no later set contains, and those that began before a time."""
+        """Release sweeps that no later set contains, and sweeps that began before a time."""
         waiting = {id(sweep) for sweep in self._policy.waiting}
         for key, held in list(self._held.items()):
             is_done = held.is_published and key not in waiting

@@ -232,7 +232,7 @@ class GapLoss:
 
 
 def _in_order(parts: list[_Packets]) -> _Packets:
-    """All packets by stamp; those of equal stamps by receive time."""
+    """All packets by stamp, then by receive time."""
     rows = _Packets(
         np.concatenate([part.stamp_ns for part in parts]),
         np.concatenate([part.host_ns for part in parts]),

@@ -20,7 +20,7 @@ OTHER = "Options"
 MAX_WIDTH = 120
 # Rows of a group: names of a parameter and their help.
 Rows = list[tuple[str, str]]
-# Of the options of each group, in the order of help; those that not only `convert` has come last.
+# Group of each option, in the order of help; options of commands other than `convert` come last.
 _OTHERS: Mapping[str, str] = {
     **{"recordings": "Input", "whole": "Input", "tolerance": "Batching", "timeout": "Batching"},
     **{name: "Output" for name in ("figures", "as_json", "write_rig")},

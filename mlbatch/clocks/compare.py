@@ -45,7 +45,7 @@ Named: TypeAlias = tuple[str, ClockEstimate]
 
 
 class Correction(NamedTuple):
-    """Correction that makes the stamps of a sensor comparable with those of `reference`."""
+    """Correction that makes the stamps of a sensor comparable with stamps of `reference`."""
 
     sensor: str
     reference: str
@@ -339,7 +339,7 @@ def refuse_incomparable(
     """Compare sensor `number` with all others that have a packet; ClockError beyond 1 s.
 
     offsets_ns: name of each sensor and its first stamp minus the receive time of its packet;
-    has_receive_times: False if packets of a sensor have none of their own, as those of clouds.
+    has_receive_times: False if packets of a sensor have none, like packets of clouds.
     """
     by_host = "use --align-clocks or --clock host, or " if has_receive_times else ""
     name, mine_ns = offsets_ns[number]

@@ -1,6 +1,6 @@
 """`mlbatch compare`: sets of joined sweeps against windows, from the same columns.
 
-Only timestamps and rotor positions are read. The columns are those of the batching, from the window
+Only timestamps and rotor positions are read. Columns are as in batching, from the window
 before its start (eq. 1) to the end, for all join policies.
 """
 

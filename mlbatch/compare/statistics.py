@@ -121,7 +121,7 @@ class SetStatistics:
         self._is_reused = [False] * sensors
         self._spans_ns = array("q")
         self._aparts_ns = array("q")
-        # Of every set, also of those with one sensor.
+        # Of every set, including sets with one sensor.
         self._firsts_ns = array("q")
         self._all_aparts_ns = array("q")
         self._latencies_ns = array("q")

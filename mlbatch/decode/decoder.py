@@ -142,7 +142,7 @@ class Decoder:
             self._buffer = self._new_buffer(rows)
 
     def _sort(self, points: int) -> None:
-        """Sort the points of a dense scan by time, those of one time by column."""
+        """Sort the points of a dense scan by time, then by column."""
         if self._unsorted.rows < self._buffer.rows:
             self._unsorted = self._new_buffer(self._buffer.rows)
         self._buffer, self._unsorted = self._unsorted, self._buffer

@@ -25,7 +25,7 @@ _UNSURE = np.float32(2)
 _NEAR_COLUMNS = 16
 # As in `native.h`.
 _SPARE_SLOTS = 4
-# Points beyond those of a column that the loops may overwrite.
+# Points after a column that the loops may overwrite.
 _SPARE_POINTS = 4
 
 

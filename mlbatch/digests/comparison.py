@@ -114,7 +114,7 @@ def _compare_field(result: Comparison, where: str, name: str, old: Json, new: Js
         for key in ("mean", "min", "max", "samples")
         for difference in walk(f"{where} {name} {key}", old.get(key), new.get(key))
     ]
-    # Other points may differ than those of the figures.
+    # The figures may hide differences at other points.
     checksums = (old.get("sha256"), new.get("sha256"))
     result.differences += found or [Difference(f"{where} {name} sha256", *checksums)]
 

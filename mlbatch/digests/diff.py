@@ -27,7 +27,7 @@ class _Key(NamedTuple):
 
 @dataclass(slots=True)
 class FieldDifference:
-    """A field that differs; values a, b and point are those of its first difference."""
+    """A field that differs; a, b and point are at its first difference."""
 
     field: str
     scan: str
@@ -88,7 +88,7 @@ def diff(a: Path, b: Path, tolerance: float = 0.0) -> OutputDiff:
 
 
 def _pairs(a: Path, b: Path) -> Iterator[tuple[_Key, Scan | None, Scan | None]]:
-    """Scans of both outputs by window; those of one of them with None.
+    """Scans of both outputs by window, with None where one output lacks the scan.
 
     Scans wait for their counterpart while that can come: folders have them sensor by sensor, other
     outputs window by window.

@@ -325,7 +325,7 @@ def _why_apart(recordings: Sequence[Recording], selection: SensorSelection, rig:
 
 
 def _may_be(sensor: RigSensor, stream: Stream, what: str) -> bool:
-    """True if packets of a stream may be those of a sensor of the rig."""
+    """True if a sensor of the rig may have sent the packets of a stream."""
     selector = sensor.stream
     if selector is None:
         return True

@@ -173,7 +173,7 @@ class ExtrinsicsSources:
             self._unused[transform[1]] = str(err)
 
     def _trees(self) -> dict[str, FrameTree]:
-        """Edges of every source, in order of trust; of /tf those that never changed."""
+        """Edges of every source, in order of trust; of /tf only edges that never changed."""
         constant = FrameTree()
         for (parent, child), transform in self._tf.items():
             if transform.is_constant:

@@ -139,7 +139,7 @@ class FirstSeconds:
     def whole(
         self, by_log_time: ByLogTime | None = None, seen: Seen | None = None
     ) -> Generator[PacketBatch, None, None]:
-        """Yield all packets of the session, as `merge` does; those that are kept are not read."""
+        """Yield all packets of the session, as `merge` does; kept packets are not read again."""
         if self._is_all and self._kept is not None:
             yield from self._kept
             return

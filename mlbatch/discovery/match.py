@@ -288,7 +288,7 @@ class ExpectedSensor(NamedTuple):
 
     @property
     def decode(self) -> dict[str, str]:
-        """Options of its decoder: the rig's before those of the command line."""
+        """Options of its decoder: the rig's, else the command line's."""
         return {**self.options, **self.rig.decode}
 
     def usable(self) -> list[Calibration]:
@@ -478,7 +478,7 @@ def _silent(
     used: Collection[str],
     origin: Path,
 ) -> DetectedSensor:
-    """A sensor of the rig that sent no packet; used: calibrations of those that did."""
+    """A sensor of the rig that sent no packet; used: calibrations of sensors that did."""
     start = f"{origin}: sensor {expected.name}:"
     lidar: Lidar | None = None
     others = lidars_on(sampler, expected.selector, unknown)

@@ -177,7 +177,7 @@ def iso(host_ns: int) -> str:
 
 @dataclass(slots=True)
 class _Copies:
-    """Instants that two recordings have of one lidar; others: those with other packets."""
+    """Instants that two recordings share of a lidar; others: instants whose packets differ."""
 
     instants: int = 0
     others: int = 0

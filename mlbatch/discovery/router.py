@@ -30,7 +30,7 @@ class Route(NamedTuple):
     """Destination of the packets of a kind."""
 
     role: Role
-    sensors: tuple[int, ...] = ()  # indices of those that may have sent them
+    sensors: tuple[int, ...] = ()  # indices of sensors that may have sent them
 
 
 _UNASSIGNED = Route(Role.UNASSIGNED)

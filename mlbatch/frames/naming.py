@@ -145,7 +145,7 @@ def namespace(topic: str) -> list[str]:
 
 
 def same_namespace(topic_a: str, topic_b: str) -> bool:
-    """Return whether two topics differ in their last part only, as those of one driver do."""
+    """Return whether two topics differ only in their last part, like topics of one driver."""
     return namespace(topic_a) == namespace(topic_b)
 
 

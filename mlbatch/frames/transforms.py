@@ -18,7 +18,7 @@ from mlbatch.units import RAD_PER_DEG
 
 # Deviation from a rotation that is accepted and corrected.
 TOLERANCE = 1e-3
-# Above the rounding errors of computed matrices, below those of numbers with few digits.
+# Above rounding errors of computed matrices, below rounding errors of numbers with few digits.
 _ROUNDING = 1e-12
 # Products of larger numbers overflow.
 _LARGEST = 1e100

@@ -61,7 +61,7 @@ def joints(text: str) -> list[Joint]:
 
 @dataclass(slots=True)
 class _Element:
-    """A `joint` element: its attributes, and those of its child elements by name."""
+    """A `joint` element: its attributes, and the attributes of child elements by name."""
 
     attributes: Mapping[str, str]
     inner: dict[str, Mapping[str, str]] = field(default_factory=dict)

@@ -1,6 +1,6 @@
 """Headers of packets by compiled loops (`native/headers.c`), from their layouts as tables.
 
-A vendor describes its packets by one of the tuples below, whose fields are those of the struct of
+A vendor describes its packets by one of the tuples below, which has the fields of the struct of
 the same name in C. All that is read of a packet but its pixels follows from it: whether it is the
 sensor's and good, its number, and the columns. Checks are rows of first byte, bytes and the
 little-endian value there; places of numbers are first bytes of the packet, -1 where it has none.

@@ -155,7 +155,7 @@ class LocalMap:
         return is_plane, is_stem
 
     def _continues(self, key: I64Array, mean_m: F64Array, normal: F64Array) -> BoolArray:
-        """Mask of k planes: those with a neighbour on the same plane."""
+        """Mask (k,): True for planes with a neighbour on the same plane."""
         found = np.zeros(len(key), np.bool_)
         most_m = _FLUSH * self.edge_m
         for step in _NEIGHBOURS if len(key) else ():

@@ -67,7 +67,7 @@ FOR_CONSTANTS void gather_every(const uint8_t *from, int64_t step, int64_t count
 {
     int64_t pixel = 0;
 #if LANES == 8
-    /* Four by a shuffle of bytes, which are those of five pixels or of four and the next byte. */
+    /* Four by a shuffle of bytes, from five pixels, or from four pixels and the next byte. */
     typedef uint8_t Bytes __attribute__((vector_size(16)));
     for (; step == 3 && count >= 8 && pixel + 4 <= count; pixel += 4) {
         Bytes bytes;

@@ -1,4 +1,4 @@
-"""The compiled library and its structs; the declarations are those of `native.h`."""
+"""The compiled library and its structs, declared as in `native.h`."""
 
 from __future__ import annotations
 

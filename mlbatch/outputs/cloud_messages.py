@@ -171,7 +171,7 @@ def _add_times(scan: StoredScan, name: str | None, records: Any) -> None:
         scan.time_s = values
         scan.time_ns, scan.time_step_ns = seconds_to_ns(values)
         return
-    # Times of the clock; those of empty slots are the start.
+    # Times of the clock; empty slots have the start.
     whole_s, rest_ns = divmod(scan.start_ns, _NS)
     after_s: F64Array = np.clip(values - whole_s, -4.0, 5.0)
     scan.time_ns = np.rint(after_s * _NS).astype(np.int64) - rest_ns

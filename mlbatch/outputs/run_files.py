@@ -68,7 +68,7 @@ class RunFiles:
 
 
 def mcaps_of(output: Path) -> list[Path]:
-    """The MCAP files of an output: itself, or those in a bag folder; none in other outputs."""
+    """MCAP files of an output: itself, or the files in a bag folder; none in other outputs."""
     kind = kind_of(output).name
     if kind == "rosbag2":
         return [entry for entry in entries(output) if entry.suffix == ".mcap"]

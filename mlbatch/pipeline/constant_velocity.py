@@ -126,7 +126,7 @@ class ConstantVelocity:
         """Nothing: only points are used."""
 
     def push(self, window: Window) -> Iterator[Window]:
-        """Add the next window or slice; yield all slices of those that are complete."""
+        """Add the next window or slice; yield all slices of complete windows."""
         for whole in self._points.add(window):
             yield from self._moved(whole)
 

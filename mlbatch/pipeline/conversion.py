@@ -36,7 +36,7 @@ if TYPE_CHECKING:
     from mlbatch.pipeline.constant_velocity import ConstantVelocity
     from mlbatch.pipeline.deskew import Deskew, PoseSource
 
-# Called with the bytes read so far, those of all recordings, and the number of scans so far.
+# Called with the bytes read so far, the bytes of all recordings, and the scans so far.
 Progress = Callable[[int, int, int], None]
 Item = TypeVar("Item")
 # Timescales on which messages of an IMU are comparable with scans.

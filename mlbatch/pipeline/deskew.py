@@ -176,7 +176,7 @@ class ImuPoses:
             stamp_ns, force, rate = stamp_ns[near], force[near], rate[near]
             if not len(stamp_ns):
                 return
-        # Repeated samples, and those that were received after later ones, add nothing.
+        # Repeated samples, and samples received after later ones, add nothing.
         newest = np.maximum.accumulate(stamp_ns)
         before = np.concatenate([[self._newest_ns or -1], newest[:-1]])
         fresh = stamp_ns > before
@@ -304,7 +304,7 @@ class Deskew:
         self.source.add(imu, messages)
 
     def push(self, window: Window) -> Iterator[Window]:
-        """Add the next window; yield those whose poses are known."""
+        """Add the next window; yield windows whose poses are known."""
         self._waiting.append(window)
         self.source.advance(self._waiting[0].start_ns)
         while self._waiting and self._is_due(window.end_ns):

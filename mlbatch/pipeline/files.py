@@ -403,7 +403,7 @@ class Files:
         return self._is_own(scan.index, scan.slice)
 
     def complete(self) -> None:
-        """Raise UsageError if the interrupted run has finished other files than those of this."""
+        """Raise UsageError if the interrupted run finished files that this run does not make."""
         if self._earlier is not None and self._earlier.unused:
             raise UsageError(
                 f"{partial_path(self._target)}: expected the files of the interrupted run again, "

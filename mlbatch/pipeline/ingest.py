@@ -22,7 +22,7 @@ from mlbatch.types import ImuSamples, PacketBatch
 _WORD_BYTES = 4
 # Duplicate IMU packets are detected among this many.
 RECENT_IMU = 64
-# Maps timestamps (P, C) of packets of a sensor, received at (P,), to those that are batched.
+# Maps timestamps (P, C) of packets of a sensor, received at (P,), to timestamps for batching.
 StampMap = Callable[[Sensor, I64Array, I64Array], I64Array]
 
 
@@ -168,7 +168,7 @@ class Ingest:
     def _accept(
         self, sensor: Sensor, batch: PacketBatch, index: I64Array, owned: BoolArray
     ) -> Accepted:
-        """Keep packets that may be of a sensor, and take in those that are."""
+        """Keep packets that may be of a sensor, and accept packets that are."""
         intake = self.intakes[sensor.index]
         kept = sensor.ring.keep(batch.data, batch.start[index], batch.place)
         host_ns = batch.host_ns[index]

@@ -171,7 +171,7 @@ class Inspection:
         return (self.last_host_ns - self.first_host_ns) / NS_PER_S
 
     def recording_rows(self) -> list[list[str]]:
-        """The recordings, head first; start and duration are those of all, in the first row."""
+        """The recordings, head first; start and duration of all together are in the first row."""
         rows = [
             [one.path, one.container, f"{one.bytes / _BYTES_PER_MB:.1f}", "", ""]
             for one in self.recordings
@@ -211,7 +211,7 @@ class Inspection:
         }
 
     def clock_lines(self) -> list[str]:
-        """Verdicts on the clocks, as text; of many pairs only those that need attention."""
+        """Verdicts on the clocks, as text; of many pairs only the ones that need attention."""
         if self.clocks is None:
             return []
         lines = self.clocks.describe()
@@ -427,7 +427,7 @@ def _notes(discovery: Discovery) -> Iterator[str]:
 
 
 class _Measured:
-    """Packets of the sensors as a run takes them: their loss, clocks, and those of no sensor.
+    """Packets as a run accepts them: their loss and clocks by sensor, and packets of no sensor.
 
     sent: of each sensor, kinds with a packet of it; one that begins late may be of another.
     """

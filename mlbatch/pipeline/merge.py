@@ -322,7 +322,7 @@ def _merged_sensor(parts: Sequence[Part], number: int) -> SensorReport:
 
 
 def _unequal_points(report: RunReport) -> list[str]:
-    """Points of the scans that are not those of the sensors, as a line."""
+    """Imbalance between points of scans and points of sensors, as a line."""
     written = sum(sensor.ledger.points.written for sensor in report.sensors)
     if written == report.scans.points:
         return []

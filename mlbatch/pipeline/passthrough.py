@@ -247,7 +247,7 @@ class MessageCounts:
 
 
 def selected(topics: Iterable[Topic], patterns: Sequence[str]) -> frozenset[str]:
-    """Names of the topics to forward: all Imu topics, and those that match a pattern."""
+    """Names of the topics to forward: all Imu topics, and topics that match a pattern."""
     return frozenset(
         topic.name
         for topic in topics

@@ -381,7 +381,7 @@ def _capture(run: Conversion) -> CaptureCounts:
 
 
 def _repeated(run: Conversion) -> int:
-    """Datagrams that injected faults duplicated, less those that they removed."""
+    """Datagrams that injected faults duplicated, minus datagrams that they removed."""
     if run.session.replay is None or run.batcher.past_end:
         # With an end, only datagrams after fault injection are counted.
         return 0

@@ -125,7 +125,7 @@ class Session:
     # -- reading ------------------------------------------------------------------------------
 
     def keep_from(self, oldest_ring_indexes: Sequence[int | None]) -> None:
-        """Free the packets before those that are still needed; by sensor, None: it needs none."""
+        """Free all packets before the first one needed, by sensor; None: none is needed."""
         needed = [index for index in oldest_ring_indexes if index is not None]
         self._arena.keep_from(min(needed, default=None))
 

@@ -66,7 +66,7 @@ class FolderReader(Reader, Protocol):
 
 
 def readers() -> list[Reader]:
-    """All plug-ins, by name; those of other distributions last."""
+    """All plug-ins by name; plug-ins of other distributions come last."""
     return [*map(_reader, _names()), *_other_readers()]
 
 

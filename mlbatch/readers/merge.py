@@ -41,7 +41,7 @@ def merge(
 ) -> Generator[PacketBatch, None, None]:
     """Yield all packets of all recordings; batches of a single recording are passed on as they are.
 
-    Each recording is opened at its first receive time: memory contains those that overlap, not all.
+    Each recording is opened at its first receive time: only overlapping ones are in memory.
     by_log_time: whether to order a recording by the log times of its messages; only for recordings
     without packets, which have times of their own; seen: called for what several recordings give.
     """
@@ -161,7 +161,7 @@ class _Feed:
         return self._packets is None and not self.is_read
 
     def advance(self) -> None:
-        """Get the next batch; its bytes replace those of the one before."""
+        """Get the next batch; its bytes replace the bytes of the one before."""
         self.batch = self._next()
         self.ended = self.batch is None
 

@@ -343,7 +343,7 @@ def _fill_cell(fill: float) -> str:
 
 
 def merged_table(tables: Sequence[str]) -> str:
-    """The table of all scans from those of shards, which share no row."""
+    """Join the tables of shards, which share no row."""
     header = ""
     rows: list[tuple[int, int, str]] = []
     for table in tables:

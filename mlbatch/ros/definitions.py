@@ -1,4 +1,4 @@
-"""Definitions of messages: one table of our own, those of a recording, those of `rosbags`.
+"""Definitions of messages: a table of our own, from the recording, from `rosbags`.
 
 The syntax is that of .msg files (ROS 1 and ROS 2), whose dependencies follow the main text after a
 line of `=` and one of `MSG: package/Type`. Types of drivers: docs/sources/messages.md, section 1;
@@ -129,7 +129,7 @@ def type_key(name: str) -> str:
 
 @lru_cache(maxsize=64)
 def definitions_of(topic: Topic) -> Definitions:
-    """All types that a topic's messages consist of; those of the recording win over ours."""
+    """All types in a topic's messages; definitions in the recording win over ours."""
     if len(topic.definition) > _MOST_CHARACTERS:
         return _ours(topic.encoding)
     if topic.format == "ros2idl":

@@ -44,7 +44,7 @@ _RING_SLOTS = (16, 32, 64, 128, MOST_SLOTS)
 _MOST_PER_POINT = 4
 # If all points of the first cloud have one time, it says nothing about columns.
 _DEFAULT_SLOTS = 16
-# A cloud whose points share fewer times than those of the first one must not fill the memory.
+# A later cloud with more distinct times than the first one must not fill the memory.
 _MOST_GROWTH = 32
 _FREE_BYTES = 16 << 20
 

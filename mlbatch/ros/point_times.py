@@ -248,7 +248,7 @@ def _unit_name(unit_ns: int) -> str:
 
 
 def _check_values(low: float, high: float, zero: Zero, reading: Reading) -> None:
-    """Refuse times that cannot be those of one sweep."""
+    """Refuse times that cannot belong to one sweep."""
     unit_ns, is_absolute = reading
     remedy = "give its unit in the rig (points: {unit: us}), or record the raw packets"
     span_s = (high - low) * (unit_ns / NS_PER_S)

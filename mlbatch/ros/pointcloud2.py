@@ -299,7 +299,7 @@ _MOST_LISTS = 8
 
 
 def _field_list(cursor: Cursor) -> _FieldList:
-    """The next fields of a message; mostly those of the message before, which are not read again.
+    """The next fields of a message; if equal to the message before, they are not read again.
 
     A list says itself where it ends: equal bytes are an equal list.
     """

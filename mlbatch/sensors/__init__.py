@@ -75,7 +75,7 @@ class Plugin(Protocol):
 
 
 def plugins() -> tuple[Plugin, ...]:
-    """All plug-ins, sorted by name; those of other distributions last."""
+    """All plug-ins by name; plug-ins of other distributions come last."""
     return tuple(_load_lazily(_names()))
 
 

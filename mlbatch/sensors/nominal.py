@@ -1,4 +1,4 @@
-"""Elevations in a calibration file against those of the model that its packets are of.
+"""Compare elevations in a calibration file with the model of the packets.
 
 Files of other models with as many lines can be read as well, and give wrong points.
 """
@@ -18,7 +18,7 @@ Span = tuple[float, float]
 
 
 def apart_deg(elevation_deg: F64Array, span: Span) -> float:
-    """Largest difference of the outer beams to those of a model."""
+    """Largest difference of the outer beams from a model."""
     lowest, highest = span
     return max(abs(float(elevation_deg.min()) - lowest), abs(float(elevation_deg.max()) - highest))
 

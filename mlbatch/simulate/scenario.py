@@ -100,7 +100,7 @@ class LidarPlan:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ImuPlan:
-    """An IMU of the body, whose messages are `sensor_msgs/Imu`."""
+    """An IMU on the body; its messages are `sensor_msgs/Imu`."""
 
     name: str
     topic: str

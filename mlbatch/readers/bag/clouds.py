@@ -158,7 +158,7 @@ class CloudRecording(WrappedRecording):
         return ", ".join(f"{stream}: {layout}" for stream, layout in found.items())
 
     def packets(self) -> Generator[PacketBatch, None, None]:
-        """Yield all packets from the start, those of clouds among them; each call is a new pass."""
+        """Yield all packets from the start, including clouds; each call is a new pass."""
         self._counts = {topic.name: _TopicCounts() for topic in self.clouds.topics}
         arena = self._next_arena
         self._next_arena = None

@@ -36,7 +36,7 @@ from mlbatch.types import (
     StreamTable,
 )
 
-# Room for fragments of earlier buffers in addition to those of this one.
+# Room for fragments of earlier buffers besides fragments of this one.
 _FRONT_EXTRA_BYTES = 1 << 20
 # The largest snapshot length of libpcap; a longer frame is a damaged record header.
 MAX_FRAME_BYTES = 1 << 18

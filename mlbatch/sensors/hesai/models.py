@@ -92,7 +92,7 @@ class Model:
         is the row by operation mode and azimuth state.
     silent: largest raw distance that means no return.
     elevation_deg: lowest and highest beam of the data sheet, None: not checked.
-    same_packets_as: the model whose packets equal those of this one.
+    same_packets_as: a model with equal packets.
     """
 
     name: str
@@ -180,7 +180,7 @@ PANDAR40P = Model(
     unit=3,
     unit_mm_at=None,
 )
-# Only its angles differ from those of a Pandar40P.
+# Only its angles differ from a Pandar40P.
 PANDAR40M = replace(
     PANDAR40P, name="Pandar40M", verified="two sources", same_packets_as="Pandar40P"
 )

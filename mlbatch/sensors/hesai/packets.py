@@ -3,7 +3,7 @@
 Source: docs/sources/hesai.md sections 2 to 5 (dates: 4) and 7. A column is a firing group: one
 block for each return, all of one azimuth. Time of a block is that of firing offset 0, and so is its
 azimuth, but for XT models (`Timing.azimuth_ns`); some models count offsets back from there, so
-timestamp and angle of a column are those of its earliest firing.
+timestamp and angle of a column belong to its earliest firing.
 """
 
 from __future__ import annotations

@@ -156,7 +156,7 @@ class LivoxLidar(BaseLidar):
 
 
 def _is_continuous(packets: U8Array) -> bool:
-    """Whether the packet counter counts all packets, rather than those of each frame.
+    """Whether the packet counter counts all packets, not packets of each frame.
 
     A continuous counter grows in proportion to time, even if packets are lost. A counter that
     restarts with every frame would make later packets look like duplicates.

@@ -116,7 +116,7 @@ def _header_field(packets: U8Array, header: HeaderLayout, field: str) -> I64Arra
 def wrong_crc(packets: U8Array) -> BoolArray:
     """(P,) whether the checksum of packets with a STANDARD header is wrong.
 
-    Those of early firmware have none.
+    Packets of early firmware have no checksum.
     """
     from mlbatch.sensors.crc import crc64
 
