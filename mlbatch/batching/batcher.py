@@ -2,7 +2,7 @@
 
 The paper takes the smallest waiting stamp of all sensors, converts that column, advances. Here the
 columns of a batch wait as small records, and a stable sort by stamp merges closed windows.
-`reference.py` implements the same rules in plain loops; tests compare both.
+`tests/reference/batching.py` implements the same rules in plain loops; tests compare both.
 
 Terms of event-time stream processing:
 - t0: the first stamp of a sensor. Eq. (1) gives t_init, the start of the first window, from the

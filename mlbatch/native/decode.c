@@ -275,7 +275,7 @@ FOR_CONSTANTS void place(const Beams *beams, int has_origin, int64_t used, int64
     }
 }
 
-/* Points of all returns; those of beams without any range are undefined. */
+/* Points of all returns; undefined for beams without any range. */
 FOR_CONSTANTS void place_all(const Beams *beams, int has_origin, int64_t used, int64_t returns,
                              const float *ranges_m, Planes *planes)
 {
@@ -701,7 +701,7 @@ typedef float Point __attribute__((vector_size(16)));
 
 enum { NAN_BITS = 0x7FC00000 };
 
-/* Elements of a plane; blanks: NaN for those that are not kept. */
+/* Elements of a plane; blanks: NaN for elements that are not kept. */
 static inline Floats load_kept(const float *plane, Ints keep, int blanks)
 {
     const Floats values = load(plane);
@@ -829,7 +829,7 @@ static int64_t organized_row(const Scan *scan, int64_t column)
     return scan->records ? column % scan->near_columns : scan->first_number + column;
 }
 
-/* Labels of elements, those of empty slots where they are not kept. */
+/* Labels of elements; where an element is not kept, the label of an empty slot. */
 static void to_labels(const int64_t *restrict words, int64_t offset_ns, int64_t empty,
                       int64_t elements, const int32_t *restrict keep, int64_t *restrict labels)
 {

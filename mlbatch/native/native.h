@@ -356,7 +356,7 @@ typedef struct {
     const uint64_t *odd; /* factors of the hash of a content */
 } Reader;
 
-/* Verdicts on packets: those of `lidar.interface.FAULTS`, then those of `intake.c`. */
+/* Verdicts on packets: the faults of `lidar.interface.FAULTS`, then the ones of `intake.c`. */
 enum { GOOD, BAD_SIZE, BAD_HEADER, BAD_CRC, DUPLICATE, BAD_STAMP, VERDICTS };
 
 /* The header of a packet; that of a packet that is not good is any. */

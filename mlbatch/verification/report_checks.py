@@ -62,7 +62,7 @@ def grid_of(metadata: RunMetadata, where: str) -> Grid | None:
     except UsageError as err:
         raise VerifyError(f"{where}: {err}") from err
     if not 1 <= slices <= _MOST_SLICES:
-        expected = f"1 to {_MOST_SLICES} slices a window"
+        expected = f"1 to {_MOST_SLICES} slices per window"
         raise VerifyError(f"{where}: expected {expected}, found {slices}; convert again")
     return Grid(rate, slices)
 

@@ -47,7 +47,7 @@ Options = Mapping[str, str | bool]
 
 @dataclass(frozen=True, slots=True)
 class Dataset:
-    """A folder `raw` with a folder a session, a manifest, and an environment for drivers."""
+    """A folder `raw` with one folder per session, a manifest, and an environment for drivers."""
 
     folder: Path
 
