@@ -209,7 +209,7 @@ class GapLoss:
         self._waiting += len(packets)
         if self._waiting >= self._limit:
             self._evaluate()
-            # Grows with the waiting packets: with a constant limit time is their number squared.
+            # Grows with the waiting packets: a constant limit would take time by their square.
             self._limit = max(3 * _CHUNK, self._waiting + max(_CHUNK, self._waiting // 4))
 
     def _evaluate(self) -> None:

@@ -225,7 +225,7 @@ def _motion_notes(run: Conversion) -> Iterator[Note]:
 
 
 def _loss_notes(run: Conversion) -> Iterator[Note]:
-    """Sensors that lost packets, or lack half of their columns in a scan."""
+    """Sensors that lost packets, or sent less than half of their columns in a scan."""
     scans = None if run.table is None else run.table.statistics(0)
     for sensor in run.sensors:
         packets = sensor.ledger.packets
