@@ -1,201 +1,224 @@
-"""Lidar-inertial odometry on batches of one and two lidars, in N slices per window, in two forests.
+"""The case study of the paper on simulated forests: one and two lidars, every N-th scan.
 
-    python casestudy.py --seeds 3            # `make casestudy`
+    python casestudy.py                      # `make casestudy`: everything, an hour or two
+    python casestudy.py --seeds 1 --duration 40
+    python casestudy.py --recordings drives  # write the recordings for other programs, run nothing
 
-docs/does-it-help.md describes method, figures and results. Cells that are finished are kept.
+docs/does-it-help.md describes method, figures and results. Runs that are finished are kept.
 """
 
 from __future__ import annotations
 
 import argparse
 import csv
+import hashlib
 import json
-import shutil
 import subprocess
 import sys
-import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 from importlib.metadata import version
 from pathlib import Path
 
 import numpy as np
+import report
 import yaml
-from evaluation import Array, Track, at_times, read_tum, relative_errors
-from inertial import Cloud, Imu, Odometry
-from results import median_interval, statement
+from drift import Drift, aligned_poses, drift, on_reference
+from evaluation import Array, Track, read_tum, write_tum
+from inertial import SCAN_S, Cloud, Diverged, Imu, Odometry
+from ndt import Indices
 
+import mlbatch
 import mlbatch.simulate
 
-SCENARIOS = ("forest-easy", "forest-hard")
-SLICES = (1, 5, 10, 15)
-LIDARS = ("one", "two")
-RATE_HZ = 10
-# Both scenarios: standstill, and where their IMU is in the body frame (without rotation).
-STANDSTILL_S = 2.0
+SCENES = ("harvester-easy", "harvester-hard")
+RATE_HZ = round(1.0 / SCAN_S)
+# Only every N-th scan updates the algorithm; from which scan on, as replicates.
+PHASES = {1: (0,), 5: (0, 2), 10: (0, 3, 6), 15: (0, 5, 10)}
+LIDARS = ("left", "right", "both")
+WINDOW = "window"
+# Where the IMU is in the body frame (without rotation), and how long the machine stands first.
 IMU_IN_BODY_M = np.array([0.0, 0.0, 1.2])
 BEGIN_S = 1.6
-# The machine, m, body frame: chassis and cabin, which both lidars see, and what is removed.
-MACHINE = (
-    {"centre_m": [0.0, 0.0, 0.95], "size_m": [4.4, 2.1, 0.9]},
-    {"centre_m": [-0.4, 0.0, 1.85], "size_m": [1.8, 1.5, 0.9]},
-)
-EGO_BOX = "-2.5,-1.2,0.4,2.5,1.2,3.2"
-# Constant, as of a small unit that was not calibrated: rad/s and m/s2.
-IMU_BIAS = {"gyro_bias": [0.01, -0.006, 0.004], "accel_bias": [0.06, -0.04, 0.05]}
-# Part of the settings by which cells are kept: change it with the method.
-METHOD = "3"
+# "sized with the preference on removing all machine points"
+MACHINE_BOX = (-4.0, -2.5, 0.0, 8.5, 2.5, 5.0)
+MIN_RANGE_M = 0.8
+# Part of the settings by which runs are kept: change it with the method.
+METHOD = "5"
 
 
 @dataclass(frozen=True, slots=True)
-class Cell:
-    """A run: lidars of LIDARS; with_truth: the floor."""
+class Run:
+    """Lidars of LIDARS, N, first scan; batching: of `mlbatch`."""
 
-    scenario: str
     lidars: str
-    slices: int
-    with_truth: bool
+    every: int
+    phase: int
+    batching: str = WINDOW
 
     @property
     def name(self) -> str:
-        """Of its file."""
-        return f"{self.lidars}-{self.slices}-{'floor' if self.with_truth else 'odometry'}"
+        """Of its files."""
+        return f"{self.lidars}-{self.every}-{self.phase}-{self.batching}"
 
 
 @dataclass(frozen=True, slots=True)
-class Drift:
-    """RMSE of relative errors over 1 s; end: position error in % of the path.
+class Outcome:
+    """What a run led to; ended: why it ended early, or empty; unmatched: of its nodes."""
 
-    nodes: of the graph; unmatched: of these, by the IMU alone.
-    """
-
-    rpe_m: float
-    rpe_deg: float
-    end_percent: float
-    path_m: float
-    cpu_s: float
+    drift: Drift | None
+    ended: str
     nodes: int
     unmatched: int
 
 
+RUNS = tuple(
+    Run(lidars, every, phase)
+    for lidars in LIDARS
+    for every, phases in PHASES.items()
+    for phase in phases
+)
+# The control that the paper lacks: sweeps of both lidars, joined by the nearest stamp.
+CONTROLS = tuple(Run("both", every, 0, "approximate") for every in PHASES)
+
+
 def main() -> None:
-    """Run all cells that are missing, then print the tables."""
-    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument("-o", "--output", type=Path, default=Path("build/casestudy"))
-    parser.add_argument("--seeds", type=int, default=3, help="forests of each kind [3]")
-    parser.add_argument("--duration", type=float, default=10.0, help="with 2 s at rest, s [10]")
-    parser.add_argument("--scenarios", nargs="+", choices=SCENARIOS, default=SCENARIOS)
-    parser.add_argument("--slices", nargs="+", type=int, default=SLICES, help="[1 5 10 15]")
-    options = parser.parse_args()
-    found: dict[Cell, dict[int, Drift]] = {}
+    """Run all that is missing, then print the tables."""
+    options = _options()
+    if options.recordings is not None:
+        _write_recordings(options)
+        return
+    found: dict[tuple[str, int], dict[Run, Outcome]] = {}
     for seed in range(1, options.seeds + 1):
-        for scenario in options.scenarios:
-            for cell, drift in _world(scenario, seed, options):
-                found.setdefault(cell, {})[seed] = drift
+        for scene in options.scenes:
+            found[scene, seed] = _scene(scene, seed, options)
     _write_csv(options.output / "casestudy.csv", found)
-    lines = _tables(found, options)
+    lines = report.tables(found, options.scenes, LIDARS, tuple(PHASES))
     (options.output / "casestudy.md").write_text("\n".join(lines) + "\n", encoding="utf-8")
+    report.draw(options.output / "casestudy.png", found, options.scenes, LIDARS, tuple(PHASES))
     print("\n".join(lines))
 
 
-# -- cells ----------------------------------------------------------------------------------------
+def _options() -> argparse.Namespace:
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("-o", "--output", type=Path, default=Path("build/casestudy"))
+    parser.add_argument("--seeds", type=int, default=5, help="forests of each kind [5]")
+    parser.add_argument("--duration", type=float, default=115.0, help="of each drive, s [115]")
+    parser.add_argument("--scenes", nargs="+", choices=SCENES, default=SCENES)
+    parser.add_argument("--runs", nargs="+", metavar="NAME", help="some, as left-10-3-window")
+    parser.add_argument("--lidar", default="OS0-64", help="model of both [OS0-64]")
+    parser.add_argument("--columns", type=int, default=512, help="per revolution [512]")
+    parser.add_argument("--recordings", type=Path, help="write recordings to a folder, run nothing")
+    parser.add_argument("--evo", action="store_true", help="check each drift with evo")
+    return parser.parse_args()
 
 
-def _world(scenario: str, seed: int, options: argparse.Namespace) -> Iterator[tuple[Cell, Drift]]:
-    """Yield the cells of one forest."""
-    folder = options.output / f"{scenario}-{seed:02d}"
+# -- a drive --------------------------------------------------------------------------------------
+
+
+def _scene(scene: str, seed: int, options: argparse.Namespace) -> dict[Run, Outcome]:
+    """Run everything on one drive."""
+    folder: Path = options.output / f"{scene}-{seed:02d}"
     folder.mkdir(parents=True, exist_ok=True)
     settings = {
-        "method": METHOD,
-        "scenario": scenario,
-        "seed": seed,
-        "duration_s": options.duration,
-        "gtsam": version("gtsam"),
-    }
-    recording = folder / "drive.pcap"
-    for slices in options.slices:
-        scans = folder / f"scans-{slices}"
-        for lidars in LIDARS:
-            for with_truth in (False, True):
-                cell = Cell(scenario, lidars, slices, with_truth)
-                path = folder / f"{cell.name}.json"
-                drift = _kept(path, settings)
-                if drift is None:
-                    if not recording.exists():
-                        _simulate(scenario, seed, options.duration, recording)
-                    if not scans.exists():
-                        _convert(recording, scans, slices)
-                    drift = _run(cell, folder, scans)
-                    kept = {"settings": settings, "drift": asdict(drift)}
-                    path.write_text(json.dumps(kept, indent=1) + "\n", encoding="utf-8")
-                    print(f"{folder.name}: {cell.name}: {drift}", flush=True)
-                yield cell, drift
-        shutil.rmtree(scans, ignore_errors=True)
-    recording.unlink(missing_ok=True)
+        "method": METHOD, "seed": seed, "duration_s": options.duration, "lidar": options.lidar,
+        "columns": options.columns, "gtsam": version("gtsam"),
+    }  # fmt: skip
+    runs = [run for run in (*RUNS, *CONTROLS) if not options.runs or run.name in options.runs]
+    kept = {run: _kept(folder / f"{run.name}.json", settings) for run in runs}
+    missing = [run for run, outcome in kept.items() if outcome is None]
+    if missing:
+        recording = folder / "drive.pcap"
+        _simulate(scene, seed, recording, options)
+        truth = _moved_to_imu(read_tum(folder / "drive.truth.tum"))
+        for batching in dict.fromkeys(run.batching for run in missing):
+            own = [run for run in missing if run.batching == batching]
+            for run, done, track in _odometry(recording, own, truth):
+                kept[run] = done
+                if track is not None:
+                    write_tum(folder / f"{run.name}.tum", track)
+                text = json.dumps({"settings": settings, "outcome": asdict(done)}, indent=1)
+                (folder / f"{run.name}.json").write_text(text + "\n", encoding="utf-8")
+                print(f"{folder.name}: {run.name}: {report.in_words(done)}", flush=True)
+        # The largest file; it depends on scenario and seed only.
+        recording.unlink()
+    if options.evo:
+        truth = _moved_to_imu(read_tum(folder / "drive.truth.tum"))
+        for run, outcome in kept.items():
+            if outcome is not None and outcome.drift is not None:
+                _check_with_evo(folder, run, outcome.drift, truth)
+    return {run: outcome for run, outcome in kept.items() if outcome is not None}
 
 
-def _kept(path: Path, settings: dict[str, object]) -> Drift | None:
+def _kept(path: Path, settings: dict[str, object]) -> Outcome | None:
     if not path.exists():
         return None
     kept = json.loads(path.read_text(encoding="utf-8"))
-    return Drift(**kept["drift"]) if kept["settings"] == settings else None
+    if kept["settings"] != settings:
+        return None
+    values = kept["outcome"]
+    values["drift"] = None if values["drift"] is None else Drift(**values["drift"])
+    return Outcome(**values)
 
 
-def _simulate(scenario: str, seed: int, duration_s: float, recording: Path) -> None:
-    """Simulate a forest of the package, with a machine that lidars see and a biased IMU."""
-    shipped = Path(mlbatch.simulate.__file__).parent / "scenarios" / f"{scenario}.yaml"
-    content = yaml.safe_load(shipped.read_text(encoding="utf-8"))
-    content["body"] = list(MACHINE)
-    content["imu"].update(IMU_BIAS)
-    place = recording.with_name("drive.yaml")
-    place.write_text(yaml.safe_dump(content, sort_keys=False), encoding="utf-8")
-    words = ("--seed", seed, "--duration", duration_s, "--overwrite")
-    _mlbatch("simulate", place, "-o", recording, "-q", *words)
-
-
-def _convert(recording: Path, scans: Path, slices: int) -> None:
-    rig = recording.with_name("drive.rig.yaml")
-    words = ("--rate", RATE_HZ, "--slices", slices, "--exclude-box", EGO_BOX, "--min-range", 1)
-    partial = scans.with_name("converting")
-    _mlbatch("convert", recording, "--rig", rig, "-o", partial, *words, "--overwrite", "-q")
-    partial.rename(scans)
-
-
-def _mlbatch(*words: object) -> None:
-    done = subprocess.run([sys.executable, "-m", "mlbatch", *map(str, words)], check=False)
-    if done.returncode:
-        raise SystemExit(f"casestudy: `mlbatch {words[0]}` failed with exit code {done.returncode}")
-
-
-def _run(cell: Cell, folder: Path, scans: Path) -> Drift:
-    begin = time.process_time()
-    truth = _moved_to_imu(read_tum(folder / "drive.truth.tum"))
-    imu = _read_imu(folder / "drive.imu.csv")
-    start_s = float(truth.stamp_s[0])
-    clouds = [one for one in _clouds(scans, cell) if one[0] >= start_s + BEGIN_S - 1e-9]
-    odometry = Odometry(imu, clouds[0][0], truth if cell.with_truth else None)
-    poses = [odometry.add(cloud) for _, cloud in clouds]
-    track = Track(np.array([cloud.end_s for _, cloud in clouds]), np.array(poses))
-    move, turn, end, path_m = _drift(track, truth, start_s)
-    cpu_s = time.process_time() - begin
-    return Drift(move, turn, end, path_m, cpu_s, len(poses), odometry.unmatched)
-
-
-def _clouds(scans: Path, cell: Cell) -> Iterator[tuple[float, Cloud]]:
-    """Yield start and cloud of each slice, in the frame of the IMU."""
-    names = [tuple(map(int, path.stem.split("-"))) for path in scans.glob("[0-9]*.npz")]
-    for name in sorted(names):
-        file = "-".join([f"{name[0]:06d}", *map(str, name[1:])]) + ".npz"
-        with np.load(scans / file) as scan:
-            kept = scan["lidar_id"] == 0 if cell.lidars == "one" else slice(None)
-            cloud = Cloud(
-                int(scan["end_ns"]) / 1e9,
-                scan["xyz"][kept].astype(np.float64) - IMU_IN_BODY_M,
-                scan["column"][kept].astype(np.int64),
-                scan["column_stamp_ns"] / 1e9,
+def _odometry(
+    recording: Path, runs: Sequence[Run], truth: Track
+) -> Iterator[tuple[Run, Outcome, Track | None]]:
+    """Run all in lockstep, on one pass over the recording."""
+    imu = _read_imu(recording.with_name("drive.imu.csv"))
+    begin_s = float(truth.stamp_s[0]) + BEGIN_S
+    odometries = {run: Odometry(imu, begin_s) for run in runs}
+    tracks: dict[Run, list[tuple[float, Array]]] = {run: [] for run in runs}
+    ended = dict.fromkeys(runs, "")
+    for number, (cloud, lidar) in enumerate(_clouds(recording, runs[0].batching, begin_s)):
+        for run, odometry in odometries.items():
+            # The first scan makes the map, whatever the phase.
+            if ended[run] or (number and number % run.every != run.phase % run.every):
+                continue
+            try:
+                pose = odometry.add(_of_lidars(cloud, lidar, run.lidars))
+            except Diverged as error:
+                ended[run] = f"{cloud.end_s - begin_s:.1f} s: {error}"
+            else:
+                tracks[run].append((cloud.end_s, pose))
+    for run, poses in tracks.items():
+        # An alignment needs some poses.
+        track = None
+        if len(poses) > 3:
+            track = Track(
+                np.array([end for end, _ in poses]), np.array([pose for _, pose in poses])
             )
-            start_s = int(scan["start_ns"]) / 1e9
-        yield start_s, cloud
+        found = None if track is None else drift(track, truth)
+        yield run, Outcome(found, ended[run], len(poses), odometries[run].unmatched), track
+
+
+def _clouds(recording: Path, batching: str, begin_s: float) -> Iterator[tuple[Cloud, Indices]]:
+    """Yield scans without the machine, frame of the IMU, and the lidar of each point."""
+    scans = mlbatch.scans(
+        recording,
+        rig=recording.with_name("drive.rig.yaml"),
+        rate=RATE_HZ,
+        min_range=MIN_RANGE_M,
+        exclude_boxes=[MACHINE_BOX],
+        batching=batching,
+    )
+    for scan in scans:
+        # Fused sweeps end with their last column.
+        end_ns = scan.end_ns if batching == WINDOW else int(scan.column_stamp_ns.max())
+        end_s = end_ns / 1e9
+        if end_s < begin_s + SCAN_S - 1e-6 or scan.column is None:
+            continue
+        points = scan.xyz.astype(np.float64) - IMU_IN_BODY_M
+        column = scan.column.astype(np.int64)
+        cloud = Cloud(end_s, points, column, scan.column_stamp_ns / 1e9)
+        yield cloud, scan.lidar_id.astype(np.int64)
+
+
+def _of_lidars(cloud: Cloud, lidar: Indices, lidars: str) -> Cloud:
+    if lidars == "both":
+        return cloud
+    own = lidar == LIDARS.index(lidars)
+    return Cloud(cloud.end_s, cloud.points[own], cloud.column[own], cloud.column_s)
 
 
 def _moved_to_imu(track: Track) -> Track:
@@ -209,107 +232,77 @@ def _read_imu(path: Path) -> Imu:
     return Imu(table[:, 0] / 1e9, table[:, 1:4], table[:, 4:7])
 
 
-def _drift(track: Track, truth: Track, start_s: float) -> tuple[float, float, float, float]:
-    """Errors at the ends of whole windows, so at the same times for every N, since the rest."""
-    whole = np.abs(track.stamp_s * RATE_HZ - np.round(track.stamp_s * RATE_HZ)) < 1e-4
-    whole &= (track.stamp_s >= start_s + STANDSTILL_S) & (track.stamp_s <= truth.stamp_s[-1])
-    own = Track(track.stamp_s[whole], track.poses[whole])
-    reference = at_times(truth, own.stamp_s)
-    move, turn = relative_errors(own, reference, RATE_HZ)
-    path_m = float(np.sqrt((np.diff(reference.poses[:, :3, 3], axis=0) ** 2).sum(axis=1)).sum())
-    error = np.linalg.inv(_whole_move(reference)) @ _whole_move(own)
-    end = 100.0 * float(np.sqrt((error[:3, 3] ** 2).sum())) / path_m
-    return move, turn, end, path_m
+def _check_with_evo(folder: Path, run: Run, own: Drift, truth: Track) -> None:
+    """Compare with the largest APE of evo, aligned on as many first poses, from files."""
+    from evo.core import metrics
+    from evo.tools import file_interface
+
+    estimate, reference = on_reference(read_tum(folder / f"{run.name}.tum"), truth)
+    for name, track in (("estimate", estimate), ("reference", reference)):
+        write_tum(folder / f"evo-{name}.tum", track)
+    read = file_interface.read_tum_trajectory_file
+    moved, fixed = (read(str(folder / f"evo-{name}.tum")) for name in ("estimate", "reference"))
+    moved.align(fixed, n=aligned_poses(reference))
+    ape = metrics.APE(metrics.PoseRelation.translation_part)
+    ape.process_data((fixed, moved))
+    largest_m = ape.get_statistic(metrics.StatisticsType.max)
+    if abs(largest_m - own.six_m) > 1e-3:
+        raise SystemExit(
+            f"casestudy: {folder.name}: {run.name}: expected the drift of evo, {largest_m:.4f} m, "
+            f"found {own.six_m:.4f} m"
+        )
+    print(f"{folder.name}: {run.name}: {own.six_m:.4f} m, by evo {largest_m:.4f} m")
 
 
-def _whole_move(track: Track) -> Array:
-    moved: Array = np.linalg.inv(track.poses[0]) @ track.poses[-1]
-    return moved
+# -- recordings -----------------------------------------------------------------------------------
 
 
-# -- tables ---------------------------------------------------------------------------------------
+def _simulate(scene: str, seed: int, recording: Path, options: argparse.Namespace) -> None:
+    """Simulate a drive of the package's scenario, with the lidars of the options."""
+    shipped = Path(mlbatch.simulate.__file__).parent / "scenarios" / f"{scene}.yaml"
+    content = yaml.safe_load(shipped.read_text(encoding="utf-8"))
+    for sensor in content["sensors"]:
+        sensor.update(model=options.lidar, columns=options.columns)
+    scenario = recording.with_name("drive.yaml")
+    scenario.write_text(yaml.safe_dump(content, sort_keys=False), encoding="utf-8")
+    words = ("--seed", seed, "--duration", options.duration, "--overwrite", "-q")
+    command = [sys.executable, "-m", "mlbatch", "simulate", scenario, "-o", recording, *words]
+    done = subprocess.run([str(word) for word in command], check=False)
+    if done.returncode:
+        raise SystemExit(f"casestudy: `mlbatch simulate` failed with exit code {done.returncode}")
 
 
-def _write_csv(path: Path, found: dict[Cell, dict[int, Drift]]) -> None:
+def _write_recordings(options: argparse.Namespace) -> None:
+    """Write MCAP recordings with rig, truth and IMU, and SHA256SUMS of all files."""
+    sums = []
+    for seed in range(1, options.seeds + 1):
+        for scene in options.scenes:
+            folder: Path = options.recordings / f"{scene}-{seed:02d}"
+            folder.mkdir(parents=True, exist_ok=True)
+            _simulate(scene, seed, folder / "drive.mcap", options)
+            for path in sorted(folder.iterdir()):
+                own = hashlib.sha256()
+                with path.open("rb") as file:
+                    while part := file.read(1 << 20):
+                        own.update(part)
+                sums.append(f"{own.hexdigest()}  {path.relative_to(options.recordings)}")
+            print(f"wrote {folder}", flush=True)
+    (options.recordings / "SHA256SUMS").write_text("\n".join(sums) + "\n", encoding="utf-8")
+
+
+def _write_csv(path: Path, found: dict[tuple[str, int], dict[Run, Outcome]]) -> None:
     with path.open("w", newline="", encoding="utf-8") as file:
         rows = csv.writer(file)
-        rows.writerow(["scenario", "lidars", "slices", "run", "seed", *Drift.__dataclass_fields__])
-        for cell, seeds in found.items():
-            run = "floor" if cell.with_truth else "odometry"
-            for seed, drift in seeds.items():
-                values = [f"{value:.6g}" for value in asdict(drift).values()]
-                rows.writerow([cell.scenario, cell.lidars, cell.slices, run, seed, *values])
-
-
-def _tables(found: dict[Cell, dict[int, Drift]], options: argparse.Namespace) -> list[str]:
-    lines = [
-        statement([options.seeds]),
-        "",
-        "| forest | lidars | N | RPE, mm | its floor, mm | RPE, degrees | its floor, degrees "
-        "| end drift, % | its floor, % |",
-        "|---|---|---|---|---|---|---|---|---|",
-    ]
-    for scenario in options.scenarios:
-        for lidars in LIDARS:
-            for slices in options.slices:
-                own = found[Cell(scenario, lidars, slices, False)]
-                floor = found[Cell(scenario, lidars, slices, True)]
-                cells = [scenario.removeprefix("forest-"), lidars, str(slices)]
-                for key, scale, digits in (
-                    ("rpe_m", 1000.0, 1),
-                    ("rpe_deg", 1.0, 3),
-                    ("end_percent", 1.0, 2),
-                ):
-                    cells += [_cell(run, key, scale, digits) for run in (own, floor)]
-                lines.append(f"| {' | '.join(cells)} |")
-    runs = [drift for seeds in found.values() for drift in seeds.values()]
-    alone = max(runs, key=lambda one: (one.unmatched - 1) / one.nodes)
-    lines += [
-        "",
-        "Nodes by the IMU alone, after the first (its map is empty): in no run more than "
-        f"{alone.unmatched - 1} of {alone.nodes}.",
-    ]
-    lines += ["", *_ratios(found, options, "rpe_m", "relative position error")]
-    lines += ["", *_ratios(found, options, "end_percent", "end drift")]
-    return lines
-
-
-def _ratios(
-    found: dict[Cell, dict[int, Drift]], options: argparse.Namespace, key: str, title: str
-) -> list[str]:
-    """Two lidars against one, and N slices against whole windows, by seed."""
-    lines = [
-        f"| forest | N | {title}, two lidars / one | smaller in | two lidars, N / 1 | one lidar, "
-        "N / 1 |",
-        "|---|---|---|---|---|---|",
-    ]
-    first = options.slices[0]
-    for scenario in options.scenarios:
-        for slices in options.slices:
-            one, two = (found[Cell(scenario, lidars, slices, False)] for lidars in LIDARS)
-            wholes = [found[Cell(scenario, lidars, first, False)] for lidars in LIDARS]
-            ratios = _by_seed(two, one, key)
-            cells = [scenario.removeprefix("forest-"), str(slices), _interval(ratios, 2)]
-            cells.append(f"{sum(ratio < 1.0 for ratio in ratios)} of {len(ratios)}")
-            for own, whole in ((two, wholes[1]), (one, wholes[0])):
-                cells.append("1" if slices == first else _interval(_by_seed(own, whole, key), 2))
-            lines.append(f"| {' | '.join(cells)} |")
-    return lines
-
-
-def _by_seed(above: dict[int, Drift], below: dict[int, Drift], key: str) -> list[float]:
-    return [getattr(above[seed], key) / getattr(below[seed], key) for seed in above]
-
-
-def _cell(runs: dict[int, Drift], key: str, scale: float, digits: int) -> str:
-    return _interval([scale * getattr(one, key) for one in runs.values()], digits)
-
-
-def _interval(values: list[float], digits: int) -> str:
-    median, low, high, _ = median_interval(values)
-    if len(values) == 1:
-        return f"{median:.{digits}f}"
-    return f"{median:.{digits}f} ({low:.{digits}f} to {high:.{digits}f})"
+        drift_keys = tuple(Drift.__dataclass_fields__)
+        run_keys = tuple(Run.__dataclass_fields__)
+        rows.writerow(["scene", "seed", *run_keys, *drift_keys, "ended", "nodes", "unmatched"])
+        for (scene, seed), outcomes in found.items():
+            for run, one in outcomes.items():
+                drifts = [""] * len(drift_keys)
+                if one.drift is not None:
+                    drifts = [f"{value:.4f}" for value in asdict(one.drift).values()]
+                own = asdict(run).values()
+                rows.writerow([scene, seed, *own, *drifts, one.ended, one.nodes, one.unmatched])
 
 
 if __name__ == "__main__":

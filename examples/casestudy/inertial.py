@@ -1,7 +1,9 @@
-"""Odometry of scans and an IMU: deskew, D2D-NDT against a local map, factor graph, iSAM2.
+"""The positioning algorithm of the paper's section 2.2: IMU, D2D-NDT, factor graph, iSAM2.
 
-Each scan ends with a node of the graph: pose, velocity and biases. Between nodes: the preintegrated
-IMU; at each node: the registered pose. All in the frame of the IMU; gravity along -z.
+A scan is deskewed by the integrated IMU, registered with cells of 2.5 m from the IMU's guess, and
+enters the graph as a prior factor on its pose, next to the preintegrated IMU. After 4.0 m it is
+registered again with cells of 0.5 m and merged into the map of the last 3. All in the frame of the
+IMU; gravity along -z.
 """
 
 from __future__ import annotations
@@ -16,19 +18,25 @@ from gtsam.symbol_shorthand import B, V, X
 from ndt import Array, Indices
 from scipy.spatial.transform import Rotation
 
-LOCAL_MAP_S = 5.0
+KEYFRAME_M = 4.0
+KEYFRAMES = 3
 GRAVITY = 9.80665
 REST_S = 1.5
-# Of the IMU, per sample at 200 Hz: larger than the simulated noise of 0.002 rad/s, 0.02 m/s2.
+SCAN_S = 0.1
+# Of the IMU, per sample at 200 Hz: twice the simulated noise, for vibration between samples.
 _GYRO_NOISE = 0.003
-_ACCEL_NOISE = 0.03
+_ACCEL_NOISE = 0.02
 _GYRO_WALK = 1e-4
 _ACCEL_WALK = 1e-3
-# Of the predicted pose as a start of the registration: degrees, m.
-_PRIOR_DEG = 0.5
-_PRIOR_M = 0.05
-# Errors of neighbouring Gaussians are not independent: the information is divided by this.
+# Of a registration. Its information is that of independent Gaussians, which neighbours are not:
+# divided. Registrations to one map share its errors: no better than a floor.
 _INFLATION = 25.0
+_FLOOR = np.array([np.radians(0.1)] * 3 + [0.02] * 3)
+_LOST_M = 500.0
+
+
+class Diverged(Exception):
+    """The estimate has left the scene or is not a number."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -51,15 +59,11 @@ class Cloud:
 
 
 class Odometry:
-    """The graph and the local map; `add` takes scans in order."""
+    """The graph and the map; `add` takes the scans that update it, in order."""
 
-    def __init__(self, imu: Imu, begin_s: float, truth: Track | None = None) -> None:
-        """The rig stands until `begin_s`: biases and gravity come from the time before.
-
-        truth: the floor; true poses deskew, begin each registration and make the map.
-        """
+    def __init__(self, imu: Imu, begin_s: float) -> None:
+        """The rig stands until `begin_s`: attitude and biases come from the time before."""
         self._imu = imu
-        self._truth = truth
         self._stamp_s = begin_s
         rest = (imu.stamp_s >= begin_s - REST_S) & (imu.stamp_s <= begin_s)
         up = imu.force[rest].mean(axis=0)
@@ -67,17 +71,15 @@ class Odometry:
         pitch = np.arctan2(-up[0], np.hypot(up[1], up[2]))
         first = np.eye(4)
         first[:3, :3] = Rotation.from_euler("xyz", [roll, pitch, 0.0]).as_matrix()
-        if truth is not None:
-            first = at_times(truth, np.array([begin_s])).poses[0]
         self._state = gtsam.NavState(gtsam.Pose3(first), np.zeros(3))
         # At rest only the part along gravity can be distinguished from a tilt.
-        felt = float(np.sqrt((up**2).sum()))
-        along = up * (1.0 - GRAVITY / felt)
+        along = up * (1.0 - GRAVITY / float(np.sqrt((up**2).sum())))
         self._bias = gtsam.imuBias.ConstantBias(along, imu.rate[rest].mean(axis=0))
         self._node = 0
-        # Nodes to which the IMU alone led: their scan has no Gaussian that the map has.
+        # Nodes to which the IMU alone led.
         self.unmatched = 0
-        self._map = ndt.LocalMap(LOCAL_MAP_S)
+        self._map = ndt.KeyframeMap(KEYFRAMES)
+        self._mapped_m: Array | None = None
         self._isam = gtsam.ISAM2(gtsam.ISAM2Params())
         self._params = _imu_params()
         graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
@@ -93,54 +95,73 @@ class Odometry:
         self._isam.update(graph, values)
 
     def add(self, cloud: Cloud) -> Array:
-        """Return the pose (4, 4) at the end of a scan, and add the scan to the map."""
-        imu_factor = gtsam.PreintegratedCombinedMeasurements(self._params, self._bias)
-        poses = self._integrate(imu_factor, cloud.end_s)
-        predicted = imu_factor.predict(self._state, self._bias)
-        poses = self._truth or poses
-        column_s = np.clip(cloud.column_s, poses.stamp_s[0], poses.stamp_s[-1])
-        columns = at_times(poses, column_s).poses
-        guess = at_times(poses, np.array([min(cloud.end_s, poses.stamp_s[-1])])).poses[0]
-        points = _deskewed(cloud, np.linalg.inv(guess) @ columns)
-        match = ndt.register(ndt.voxel_gaussians(points), self._map, guess, _prior())
-        self.unmatched += match.matched == 0
-        self._update(imu_factor, predicted, match)
+        """Return the pose (4, 4) at the end of a scan; Diverged where there is none."""
+        try:
+            factor = gtsam.PreintegratedCombinedMeasurements(self._params, self._bias)
+            poses = self._integrate(factor, cloud.end_s)
+            predicted = factor.predict(self._state, self._bias)
+            guess = predicted.pose().matrix()
+            columns = at_times(poses, np.clip(cloud.column_s, *poses.stamp_s[[0, -1]])).poses
+            points = _deskewed(cloud, np.linalg.inv(guess) @ columns)
+            match = ndt.Match(guess, None)
+            if not self._map.empty:
+                rough = ndt.voxel_gaussians(points, ndt.ROUGH_M)
+                match = ndt.register(rough, self._map, guess)
+                self.unmatched += match.information is None
+            pose = self._update(factor, predicted, match)
+        # Of gtsam: an indeterminate system; of numpy: a singular matrix.
+        except (RuntimeError, np.linalg.LinAlgError, ValueError) as error:
+            raise Diverged(f"{type(error).__name__}: {error}") from error
+        if not np.isfinite(pose).all() or np.abs(pose[:3, 3]).max() > _LOST_M:
+            raise Diverged("the position has left the scene")
         self._stamp_s = cloud.end_s
-        pose: Array = self._state.pose().matrix()
-        placed = pose if self._truth is None else guess
-        self._map.insert(cloud.end_s, points @ placed[:3, :3].T + placed[:3, 3])
+        self._map_after(points, pose)
         return pose
 
+    def _map_after(self, points: Array, pose: Array) -> None:
+        """Merge a scan into the map when the machine is far enough from the last one."""
+        if self._mapped_m is not None:
+            if np.sqrt(((pose[:3, 3] - self._mapped_m) ** 2).sum()) <= KEYFRAME_M:
+                return
+            pose = ndt.register(ndt.voxel_gaussians(points, ndt.FINE_M), self._map, pose).pose
+        self._map.insert(points @ pose[:3, :3].T + pose[:3, 3])
+        self._mapped_m = pose[:3, 3].copy()
+
     def _integrate(self, factor: gtsam.PreintegratedCombinedMeasurements, end_s: float) -> Track:
-        """Integrate the samples up to a time; return the poses after each."""
+        """Integrate the samples up to a time; return the poses during the scan that ends then."""
         imu = self._imu
-        inside = (imu.stamp_s > self._stamp_s) & (imu.stamp_s < end_s)
-        bounds = np.concatenate([[self._stamp_s], imu.stamp_s[inside], [end_s]])
+        first, last = np.searchsorted(imu.stamp_s, [self._stamp_s, end_s], side="right")
+        inside = imu.stamp_s[first:last]
+        bounds = np.concatenate([[self._stamp_s], inside[inside < end_s], [end_s]])
         middle = 0.5 * (bounds[1:] + bounds[:-1])
+        near = slice(max(first - 2, 0), last + 2)
+        force, rate = (
+            np.stack([np.interp(middle, imu.stamp_s[near], part[near, axis]) for axis in range(3)])
+            for part in (imu.force, imu.rate)
+        )
         stamps, poses = [self._stamp_s], [self._state.pose().matrix()]
-        for step_s, at_s, until_s in zip(np.diff(bounds), middle, bounds[1:], strict=True):
+        for row, step_s in enumerate(np.diff(bounds)):
             if step_s < 1e-7:
                 continue
-            force = [np.interp(at_s, imu.stamp_s, imu.force[:, axis]) for axis in range(3)]
-            rate = [np.interp(at_s, imu.stamp_s, imu.rate[:, axis]) for axis in range(3)]
-            factor.integrateMeasurement(np.array(force), np.array(rate), step_s)
-            stamps.append(until_s)
-            poses.append(factor.predict(self._state, self._bias).pose().matrix())
+            factor.integrateMeasurement(force[:, row], rate[:, row], step_s)
+            if bounds[row + 1] > end_s - 1.2 * SCAN_S or len(poses) == 1:
+                stamps.append(bounds[row + 1])
+                poses.append(factor.predict(self._state, self._bias).pose().matrix())
         return Track(np.array(stamps), np.array(poses))
 
     def _update(
         self,
-        imu_factor: gtsam.PreintegratedCombinedMeasurements,
+        factor: gtsam.PreintegratedCombinedMeasurements,
         predicted: gtsam.NavState,
         match: ndt.Match,
-    ) -> None:
+    ) -> Array:
         last, node = self._node, self._node + 1
         graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
         keys = (X(last), V(last), X(node), V(node), B(last), B(node))
-        graph.push_back(gtsam.CombinedImuFactor(*keys, imu_factor))
-        if match.matched:
-            information = match.information / _INFLATION + 1e-3 * np.eye(6)
-            noise = gtsam.noiseModel.Gaussian.Information(information)
+        graph.push_back(gtsam.CombinedImuFactor(*keys, factor))
+        if match.information is not None:
+            covariance = np.linalg.inv(match.information / _INFLATION + 1e-3 * np.eye(6))
+            noise = gtsam.noiseModel.Gaussian.Covariance(covariance + np.diag(_FLOOR**2))
             graph.push_back(gtsam.PriorFactorPose3(X(node), gtsam.Pose3(match.pose), noise))
         values.insert(X(node), predicted.pose())
         values.insert(V(node), predicted.velocity())
@@ -151,6 +172,8 @@ class Odometry:
         velocity = self._isam.calculateEstimateVector(V(node))
         self._state = gtsam.NavState(pose, velocity)
         self._bias = self._isam.calculateEstimateConstantBias(B(node))
+        matrix: Array = pose.matrix()
+        return matrix
 
 
 def _deskewed(cloud: Cloud, end_from_column: Array) -> Array:
@@ -158,11 +181,6 @@ def _deskewed(cloud: Cloud, end_from_column: Array) -> Array:
     moved = end_from_column[cloud.column]
     turned: Array = np.einsum("pij,pj->pi", moved[:, :3, :3], cloud.points) + moved[:, :3, 3]
     return turned
-
-
-def _prior() -> Array:
-    sigmas = np.array([np.radians(_PRIOR_DEG)] * 3 + [_PRIOR_M] * 3)
-    return np.diag(1.0 / sigmas**2)
 
 
 def _diagonal(sigmas: object) -> gtsam.noiseModel.Diagonal:
