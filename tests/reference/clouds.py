@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import struct
+from collections.abc import Sequence
 from itertools import groupby
+from typing import Any
 
 import numpy as np
 
@@ -64,18 +66,17 @@ def packets_of(points: Points, layout: Layout) -> U8Array:
                 layers.append(free)
             free[slot] = point
         columns += [(stamp, layer) for layer in layers]
-    packets = [_packet(points, rings, layout, number, *one) for number, one in enumerate(columns)]
+    planes = (*points.reals, np.array(rings, np.uint16), points.return_type, points.tag)
+    packets = [_packet(planes, layout, number, *one) for number, one in enumerate(columns)]
     return np.frombuffer(b"".join(packets), np.uint8).reshape(len(packets), layout.size)
 
 
-def _packet(
-    points: Points, rings: list[int], layout: Layout, number: int, stamp: int, slots: _Slots
-) -> bytes:
+def _packet(planes: Sequence[Any], layout: Layout, number: int, stamp: int, slots: _Slots) -> bytes:
     """Version 1 of the format in `ros/point_packets.py`, field by field."""
     fixed = (1, layout.kind, layout.slots, stamp, number, len(slots), layout.by_ring, 0)
     parts = [b"MLPC", struct.pack("<BBHqIHBB", *fixed)]
     filled = [slots.get(slot) for slot in range(layout.slots)]
-    for plane in (*points.reals, np.array(rings, np.uint16), points.return_type, points.tag):
+    for plane in planes:
         empty = bytes(plane.dtype.itemsize)
         parts += [empty if point is None else plane[point].tobytes() for point in filled]
     content = b"".join(parts)
