@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 
+from tests.conftest import LONG
 from tests.contract.tree import PACKAGE, ROOT, Module, modules, plugins
 
 MODULES = modules()
@@ -106,3 +107,12 @@ def test_every_fixture_names_its_source() -> None:
 def test_every_folder_of_the_package_is_a_package() -> None:
     for path in PACKAGE.rglob("*.py"):
         assert (path.parent / "__init__.py").is_file(), path.parent
+
+
+@pytest.mark.parametrize("entry", LONG)
+def test_long_suites_are_there(entry: str) -> None:
+    """A folder or file that has moved would be back in `make test-quick`."""
+    place, _, function = entry.partition("::")
+    path = ROOT / "tests" / place
+    assert path.exists()
+    assert not function or f"def {function}" in path.read_text(encoding="utf-8")
