@@ -48,7 +48,7 @@ class LibraryHook(BuildHookInterface):  # type: ignore[type-arg]
         return [] if compiler() else [ZIG]
 
     def initialize(self, version: str, build_data: dict[str, Any]) -> None:
-        """Compile, beside the sources for an editable installation, else into the wheel."""
+        """Compile beside the sources, which Python finds in a clone, and into a wheel."""
         root = Path(self.root)
         self.work = tempfile.TemporaryDirectory()
         library = Path(self.work.name) / "_native.so"
@@ -67,12 +67,16 @@ class LibraryHook(BuildHookInterface):  # type: ignore[type-arg]
                 f"mlbatch: expected a working C compiler, found: {err}; mend it, choose another "
                 "by CC, or unset CC and install without any"
             ) from err
-        if version == "editable":
+        try:
             # Whole or absent, also for a process that loads it now.
             partial = root / f"{LIBRARY}.partial"
             shutil.copy(library, partial)
             os.replace(partial, root / LIBRARY)
-        else:
+        except OSError:
+            # A wheel can be built from sources that cannot be written to.
+            if version == "editable":
+                raise
+        if version != "editable":
             build_data["force_include"][str(library)] = LIBRARY
         build_data["pure_python"] = False
         platform = sysconfig.get_platform().replace("-", "_").replace(".", "_")
