@@ -172,7 +172,9 @@ FOREIGN_OPTIONS = {"--count", "--decimate", "--help", "--number", "--output-dir"
     # tests.bench.
     "--keep",
     "--seconds",
-    # examples/odometry and evo.
+    # Examples and evo.
+    "--evo",
+    "--recordings",
     "--t_offset",
     "--truth",
     "--variants",
