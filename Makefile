@@ -53,7 +53,7 @@ coverage: $(VENV)/dev.stamp
 	$(BIN)/python -m pytest -n 2 --dist worksteal --cov --cov-branch --cov-report=term:skip-covered --cov-fail-under=95
 
 test-quick: $(VENV)/dev.stamp
-	$(BIN)/python -m pytest -n 2 --dist worksteal -m 'not slow and not long'
+	$(BIN)/python -m pytest -n 2 --dist worksteal -m 'not slow and not long and not seconds'
 
 test-lowest: $(LOWEST)/dev.stamp
 	$(LOWEST)/bin/python -m pytest -n 2 --dist worksteal -m 'not slow and not long'

@@ -20,7 +20,7 @@ settings.load_profile("mlbatch")
 if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
-# Whole suites of cases: folders, files and tests that take seconds. `make test-quick` leaves them
+# Whole suites of cases: `make test-quick` and `make test-lowest` leave them
 # out; who works on their subject names them: `pytest tests/verification`.
 LONG = (
     "batch/",
@@ -36,65 +36,77 @@ LONG = (
     "simulate/",
     "verification/",
     "batching/test_reference.py",
-    "cli/test_bag_mistakes.py",
-    "cli/test_clipped.py",
-    "cli/test_clock_epoch.py",
-    "cli/test_clouds.py",
-    "cli/test_compare.py",
-    "cli/test_datasets.py",
     "cli/test_deskew.py",
-    "cli/test_fill.py",
     "cli/test_fusion.py",
-    "cli/test_jumps.py",
-    "cli/test_machine.py",
-    "cli/test_metadata.py",
-    "cli/test_mistakes.py",
-    "cli/test_outputs.py::test_an_end",
-    "cli/test_passthrough.py",
     "cli/test_progress.py",
     "cli/test_shards.py",
-    "cli/test_sort.py",
-    "cli/test_tables.py",
-    "cli/test_vendor_mistakes.py",
     "clocks/test_align.py::test_memory",
     "clocks/test_simulated.py",
-    "contract/test_docs.py::test_every_npz_key",
-    "contract/test_help.py::test_a_shell_completes",
-    "contract/test_help.py::test_help_fits_the_terminal",
+    "contract/test_blocks.py::test_blocks_run",
     "contract/test_models.py",
-    "contract/test_packaging.py",
-    "contract/test_python_page.py::test_every_option_of_the_page_works",
     "contract/test_start.py",
-    "decode/test_engine.py",
-    "discovery/test_gravity.py::test_poses",
+    "decode/test_engine.py::test_a_scan_is_that_of_its_columns",
+    "decode/test_engine.py::test_any_pixels",
+    "decode/test_engine.py::test_upright_sensors",
     "discovery/test_interleaved.py",
-    "discovery/test_match.py",
     "discovery/test_overlap.py",
     "discovery/test_router.py::test_packets_are_assigned",
-    "faults/test_laws.py",
+    "motion/test_constant_velocity.py",
+    "motion/test_poses_refused.py",
+    "motion/test_wall.py",
     "outputs/test_read.py",
+    "page/test_browser.py",
+    "page/test_comparison.py::test_it_is_drawn_in_a_browser",
     "page/test_windows.py::test_long_runs",
-    "pipeline/test_conversion.py::test_memory",
-    "pipeline/test_inspect.py",
-    "pipeline/test_passthrough.py::test_memory",
     "pipeline/test_resume.py",
-    "readers/capture/test_fragments.py::test_any_traffic",
-    "readers/capture/test_frames.py::test_frames_with_any_byte",
-    "readers/capture/test_odd.py::test_any_damage",
-    "readers/capture/test_recording.py::test_any_buffer",
-    "readers/formats/test_bags.py",
     "readers/test_buffer_ends.py",
     "rig/test_extrinsics_files.py::test_any_text",
-    "ros/test_point_rows.py::test_clouds",
-    "ros/test_row_packer.py::test_clouds",
-    "sensors/test_round_trip.py",
-    "sensors/test_sensors.py::test_bytes_that_are_all",
     "sensors/test_vendors.py",
     "writers/test_bag_writer.py",
     "writers/test_durable.py",
     "writers/test_formats.py",
     "writers/test_mcap_container.py",
     "writers/test_messages.py",
+)
+# Tests that take seconds together: `make test-quick` leaves them out as well.
+SECONDS = (
+    "cli/test_bag_mistakes.py",
+    "cli/test_clipped.py",
+    "cli/test_clock_epoch.py",
+    "cli/test_clouds.py",
+    "cli/test_compare.py",
+    "cli/test_datasets.py",
+    "cli/test_fill.py",
+    "cli/test_jumps.py",
+    "cli/test_machine.py",
+    "cli/test_metadata.py",
+    "cli/test_mistakes.py",
+    "cli/test_outputs.py::test_an_end",
+    "cli/test_passthrough.py",
+    "cli/test_sort.py",
+    "cli/test_tables.py",
+    "cli/test_vendor_mistakes.py",
+    "contract/test_docs.py::test_every_npz_key",
+    "contract/test_help.py::test_a_shell_completes",
+    "contract/test_help.py::test_help_fits_the_terminal",
+    "contract/test_packaging.py",
+    "contract/test_python_page.py::test_every_option_of_the_page_works",
+    "decode/test_engine.py",
+    "discovery/test_gravity.py::test_poses",
+    "discovery/test_match.py",
+    "faults/test_laws.py",
+    "pipeline/test_conversion.py::test_memory",
+    "pipeline/test_inspect.py",
+    "pipeline/test_passthrough.py::test_memory",
+    "readers/capture/test_fragments.py::test_any_traffic",
+    "readers/capture/test_frames.py::test_frames_with_any_byte",
+    "readers/capture/test_odd.py::test_any_damage",
+    "readers/capture/test_recording.py::test_any_buffer",
+    "readers/formats/test_bags.py",
+    "ros/test_point_rows.py::test_clouds",
+    "ros/test_row_packer.py::test_clouds",
+    "sensors/test_round_trip.py",
+    "sensors/test_sensors.py::test_bytes_that_are_all",
 )
 
 
@@ -113,11 +125,12 @@ def pytest_collection() -> Iterator[None]:
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Mark the tests of long suites."""
-    long = tuple(f"tests/{entry}" for entry in LONG)
-    for item in items:
-        if item.nodeid.startswith(long):
-            item.add_marker(pytest.mark.long)
+    """Mark the tests of long suites, and those that take seconds."""
+    for mark, entries in ((pytest.mark.long, LONG), (pytest.mark.seconds, SECONDS)):
+        starts = tuple(f"tests/{entry}" for entry in entries)
+        for item in items:
+            if item.nodeid.startswith(starts):
+                item.add_marker(mark)
 
 
 @pytest.fixture

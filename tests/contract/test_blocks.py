@@ -65,7 +65,6 @@ def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
-@pytest.mark.long
 @pytest.mark.parametrize("page", RUNNING, ids=_name)
 def test_blocks_run(page: Path, place: Path) -> None:
     names: dict[str, object] = {}

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.conftest import LONG
+from tests.conftest import LONG, SECONDS
 from tests.contract.tree import PACKAGE, ROOT, Module, modules, plugins
 
 MODULES = modules()
@@ -109,7 +109,7 @@ def test_every_folder_of_the_package_is_a_package() -> None:
         assert (path.parent / "__init__.py").is_file(), path.parent
 
 
-@pytest.mark.parametrize("entry", LONG)
+@pytest.mark.parametrize("entry", [*LONG, *SECONDS])
 def test_long_suites_are_there(entry: str) -> None:
     """A folder or file that has moved would be back in `make test-quick`."""
     place, _, function = entry.partition("::")

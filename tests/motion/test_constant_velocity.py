@@ -15,7 +15,6 @@ from tests.builders.sessions import Shell, arrays, names, report_of
 from tests.builders.simulated import Recorded, record, scenario_text
 from tests.motion.test_wall import SCENE, bend_m
 
-pytestmark = pytest.mark.long
 SENSORS = """\
   - name: lidar
     model: OS1-64

@@ -18,7 +18,6 @@ from tests.builders.simulated import Recorded, read_tum, record, scenario_text
 from tests.motion.test_constant_velocity import BOXES
 from tests.motion.test_wall import MOTION, SCENE, SENSORS
 
-pytestmark = pytest.mark.long
 MS = 1_000_000
 S = 1000 * MS
 # An IMU so quiet that its noise and its biases in degrees/s pass for a standstill.

@@ -13,7 +13,6 @@ from mlbatch.arrays import F64Array
 from tests.builders.sessions import Shell
 from tests.builders.simulated import record, scenario_text
 
-pytestmark = pytest.mark.long
 WALL = 200
 MOTION = """\
 motion:

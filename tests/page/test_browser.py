@@ -20,7 +20,7 @@ from tests.page.browser import CHROMIUM, NO_CHROMIUM, Browser, browser
 from tests.page.runs import report, sensor, table
 from tests.page.test_page import HOSTILE
 
-pytestmark = [pytest.mark.long, pytest.mark.skipif(CHROMIUM is None, reason=NO_CHROMIUM)]
+pytestmark = pytest.mark.skipif(CHROMIUM is None, reason=NO_CHROMIUM)
 
 TIME_PLOTS = ("timeline", "fill", "gap", "points", "span", "delay")
 # Share of opaque pixels, and number of different colours, of a canvas.

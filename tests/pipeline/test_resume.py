@@ -613,7 +613,6 @@ def test_no_change_of_a_byte_gives_another_scan(shell: Shell) -> None:
             assert 1 <= len(found) <= 3
 
 
-@pytest.mark.long
 def test_no_change_of_a_byte_gives_another_output(shell: Shell) -> None:
     """The same to the end, for bytes of all lines."""
     whole = _whole(shell)
