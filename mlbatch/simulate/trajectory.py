@@ -11,11 +11,10 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TypeAlias
 
 import numpy as np
 
-from mlbatch.arrays import F64Array
+from mlbatch.arrays import F64Array, I64Array
 from mlbatch.simulate.terrain import Terrain
 from mlbatch.units import STANDARD_GRAVITY
 
@@ -53,13 +52,39 @@ class Poses:
     angular_velocity: F64Array
 
 
-class Spline:
-    """A natural cubic spline through values (k, m) at increasing knots (k,)."""
+class Curve:
+    """A cubic curve through values (k, m) at increasing knots (k,); constant outside of them."""
 
     def __init__(self, knots: F64Array, values: F64Array) -> None:
-        """Compute the second derivatives; one knot: a constant."""
+        """One knot: a constant."""
         self.knots = knots
         self.values = values
+
+    def __call__(self, at: F64Array) -> tuple[F64Array, F64Array, F64Array]:
+        """Return values and two derivatives, (n, m) each."""
+        if len(self.knots) == 1:
+            value = np.repeat(self.values, len(at), axis=0)
+            return value, np.zeros_like(value), np.zeros_like(value)
+        inside = np.clip(at, self.knots[0], self.knots[-1])
+        i = np.clip(np.searchsorted(self.knots, inside, "right") - 1, 0, len(self.knots) - 2)
+        step = (self.knots[i + 1] - self.knots[i])[:, None]
+        value, first, second = self._piece(i, (inside - self.knots[i])[:, None] / step, step)
+        moving = (at == inside)[:, None]
+        return value, np.where(moving, first, 0.0), np.where(moving, second, 0.0)
+
+    def _piece(
+        self, i: I64Array, share: F64Array, step: F64Array
+    ) -> tuple[F64Array, F64Array, F64Array]:
+        """Return values and two derivatives at shares (n, 1) of the steps (n, 1) after knots i."""
+        raise NotImplementedError
+
+
+class Spline(Curve):
+    """A natural cubic spline."""
+
+    def __init__(self, knots: F64Array, values: F64Array) -> None:
+        """Compute the second derivatives."""
+        super().__init__(knots, values)
         count = len(knots)
         self.second = np.zeros_like(values)
         if count > 2:
@@ -69,15 +94,10 @@ class Spline:
             matrix += np.diag(step[1:-1], 1) + np.diag(step[1:-1], -1)
             self.second[1:-1] = np.linalg.solve(matrix, 6.0 * np.diff(slope, axis=0))
 
-    def __call__(self, at: F64Array) -> tuple[F64Array, F64Array, F64Array]:
-        """Return values and two derivatives, (n, m) each; constant outside the knots."""
-        if len(self.knots) == 1:
-            value = np.repeat(self.values, len(at), axis=0)
-            return value, np.zeros_like(value), np.zeros_like(value)
-        inside = np.clip(at, self.knots[0], self.knots[-1])
-        i = np.clip(np.searchsorted(self.knots, inside, "right") - 1, 0, len(self.knots) - 2)
-        step = (self.knots[i + 1] - self.knots[i])[:, None]
-        b = (inside - self.knots[i])[:, None] / step
+    def _piece(
+        self, i: I64Array, share: F64Array, step: F64Array
+    ) -> tuple[F64Array, F64Array, F64Array]:
+        b = share
         a = 1.0 - b
         low, high = self.values[i], self.values[i + 1]
         low2, high2 = self.second[i], self.second[i + 1]
@@ -85,12 +105,11 @@ class Spline:
         value = a * low + b * high + bend
         first = (high - low) / step
         first += ((3 * b**2 - 1) * high2 - (3 * a**2 - 1) * low2) * step / 6.0
-        moving = (at == inside)[:, None]
-        return value, np.where(moving, first, 0.0), np.where(moving, a * low2 + b * high2, 0.0)
+        return value, first, a * low2 + b * high2
 
 
-class MonotoneCurve:
-    """A cubic curve through values (k, m) at increasing knots (k,) that does not overshoot.
+class MonotoneCurve(Curve):
+    """A cubic curve that does not overshoot.
 
     Between equal values it is constant, so that a body that stops stands still. Slopes by Fritsch
     and Carlson (1980); the second derivative jumps at knots.
@@ -98,8 +117,7 @@ class MonotoneCurve:
 
     def __init__(self, knots: F64Array, values: F64Array) -> None:
         """Compute the slopes; at both ends they are 0."""
-        self.knots = knots
-        self.values = values
+        super().__init__(knots, values)
         self.slopes = np.zeros_like(values)
         if len(knots) > 2:
             step = np.diff(knots)[:, None]
@@ -113,15 +131,10 @@ class MonotoneCurve:
                 weights = near / np.where(same, before, 1.0) + far / np.where(same, after, 1.0)
             self.slopes[1:-1] = np.where(same, (near + far) / weights, 0.0)
 
-    def __call__(self, at: F64Array) -> tuple[F64Array, F64Array, F64Array]:
-        """Return values and two derivatives, (n, m) each; constant outside the knots."""
-        if len(self.knots) == 1:
-            value = np.repeat(self.values, len(at), axis=0)
-            return value, np.zeros_like(value), np.zeros_like(value)
-        inside = np.clip(at, self.knots[0], self.knots[-1])
-        i = np.clip(np.searchsorted(self.knots, inside, "right") - 1, 0, len(self.knots) - 2)
-        step = (self.knots[i + 1] - self.knots[i])[:, None]
-        u = (inside - self.knots[i])[:, None] / step
+    def _piece(
+        self, i: I64Array, share: F64Array, step: F64Array
+    ) -> tuple[F64Array, F64Array, F64Array]:
+        u = share
         low, rise = self.values[i], self.values[i + 1] - self.values[i]
         begin, end = self.slopes[i] * step, self.slopes[i + 1] * step
         # low + begin u + square u^2 + cube u^3.
@@ -129,12 +142,7 @@ class MonotoneCurve:
         cube = begin + end - 2.0 * rise
         value = low + u * (begin + u * (square + u * cube))
         first = (begin + u * (2.0 * square + 3.0 * u * cube)) / step
-        second = (2.0 * square + 6.0 * u * cube) / step**2
-        moving = (at == inside)[:, None]
-        return value, np.where(moving, first, 0.0), np.where(moving, second, 0.0)
-
-
-Curve: TypeAlias = Spline | MonotoneCurve
+        return value, first, (2.0 * square + 6.0 * u * cube) / step**2
 
 
 class Trajectory:
