@@ -26,6 +26,7 @@ import yaml
 from drift import Drift, aligned_poses, drift, on_reference
 from evaluation import Array, Track, read_tum, write_tum
 from inertial import SCAN_S, Cloud, Diverged, Imu, Odometry
+from machine import IMU_IN_BODY_M, MACHINE_BOX
 from ndt import Indices
 
 import mlbatch
@@ -37,11 +38,8 @@ RATE_HZ = round(1.0 / SCAN_S)
 PHASES = {1: (0,), 5: (0, 2), 10: (0, 3, 6), 15: (0, 5, 10)}
 LIDARS = ("left", "right", "both")
 WINDOW = "window"
-# Where the IMU is in the body frame (without rotation), and how long the machine stands first.
-IMU_IN_BODY_M = np.array([0.0, 0.0, 1.2])
+# From when on the machine, which stands for 2 s, is followed.
 BEGIN_S = 1.6
-# "sized with the preference on removing all machine points"
-MACHINE_BOX = (-4.0, -2.5, 0.0, 8.5, 2.5, 5.0)
 MIN_RANGE_M = 0.8
 # Part of the settings by which runs are kept: change it with the method.
 METHOD = "5"
@@ -223,7 +221,7 @@ def _of_lidars(cloud: Cloud, lidar: Indices, lidars: str) -> Cloud:
 
 def _moved_to_imu(track: Track) -> Track:
     poses = track.poses.copy()
-    poses[:, :3, 3] += poses[:, :3, :3] @ IMU_IN_BODY_M
+    poses[:, :3, 3] += poses[:, :3, :3] @ np.array(IMU_IN_BODY_M)
     return Track(track.stamp_s, poses)
 
 

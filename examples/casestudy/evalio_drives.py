@@ -29,14 +29,11 @@ from evalio.types import (
     Stamp,
     Trajectory,
 )
+from machine import IMU_IN_BODY_M, MACHINE_BOX
 
 import mlbatch
 
 RATE_HZ = 10
-# Of the scenarios: the IMU is above the origin of the body, without rotation.
-IMU_ABOVE_BODY_M = 1.2
-# "sized with the preference on removing all machine points"
-MACHINE_BOX = (-4.0, -2.5, 0.0, 8.5, 2.5, 5.0)
 
 
 class Drives(Dataset):  # type: ignore[misc]  # evalio is not installed here
@@ -99,7 +96,7 @@ class Drives(Dataset):  # type: ignore[misc]  # evalio is not installed here
 
     def imu_T_lidar(self) -> SE3:
         """Scans are in the body frame."""
-        return SE3(SO3.identity(), np.array([0.0, 0.0, -IMU_ABOVE_BODY_M]))
+        return SE3(SO3.identity(), -np.array(IMU_IN_BODY_M))
 
     def imu_T_gt(self) -> SE3:
         """The truth is that of the body frame."""
