@@ -46,7 +46,7 @@ def packets_only(encoding: str) -> list[Recorded]:
     ]
 
 
-def told(encoding: str = "cdr", without: str = "", **packet_types: str) -> list[Recorded]:
+def session_of(encoding: str = "cdr", without: str = "", **packet_types: str) -> list[Recorded]:
     """The whole session less the topics that end in `without`."""
     messages = fixture_messages(encoding, **packet_types)
     return [one for one in messages if not without or not one.topic.endswith(without)]

@@ -19,8 +19,8 @@ from tests.builders.sessions import SMALL, Shell, Unit
 from tests.builders.sessions_of_bags import (
     description,
     frame_message,
+    session_of,
     split_at,
-    told,
     unit_messages,
     urdf,
 )
@@ -45,17 +45,17 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def _write_sessions(folder: Path) -> None:
     one = unit_messages(Unit(), "roof")
-    write_mcap(folder / "drive.mcap", told())
-    write_folder(folder / "bag", split_at(told(), 2))
-    write_rosbag1(folder / "drive.bag", told("ros1"))
-    write_rosbag2(folder / "unmounted.db3", told(without="tf_static"))
+    write_mcap(folder / "drive.mcap", session_of())
+    write_folder(folder / "bag", split_at(session_of(), 2))
+    write_rosbag1(folder / "drive.bag", session_of("ros1"))
+    write_rosbag2(folder / "unmounted.db3", session_of(without="tf_static"))
     write_rosbag2(folder / "bare.db3", one[1:])
     write_rosbag2(folder / "stranger.db3", [_metadata(one[0], 999), *one[1:]])
     write_rosbag2(folder / "garbage.db3", [_text(one[0], "not json"), *one[1:]])
-    whole = told()
+    whole = session_of()
     contrary = [description(urdf(0.35), whole[0].log_ns), *whole]
     write_mcap(folder / "contrary.mcap", contrary)
-    write_mcap(folder / "moving.mcap", [*told(without="tf_static"), *_moving(whole)])
+    write_mcap(folder / "moving.mcap", [*session_of(without="tf_static"), *_moving(whole)])
     frame = Recorded("/roof/ouster/frames", "hesai_ros_driver/UdpFrame", one[-1].log_ns, b"")
     frame = replace(frame, data=frame_message(Unit()))
     write_rosbag2(folder / "frames.db3", [one[0], frame])
@@ -109,8 +109,8 @@ def _write_wrong_files(folder: Path) -> None:
     (folder / "papers").mkdir()
     (folder / "papers" / "notes.txt").write_text("hello\n", encoding="utf-8")
     (folder / "mixed").mkdir()
-    write_mcap(folder / "mixed" / "a.mcap", told()[:9])
-    write_rosbag2(folder / "mixed" / "a.db3", told()[:9])
+    write_mcap(folder / "mixed" / "a.mcap", session_of()[:9])
+    write_rosbag2(folder / "mixed" / "a.db3", session_of()[:9])
     (folder / "text.db3").write_text("hello\n", encoding="utf-8")
     (folder / "empty.db3").touch()
     with sqlite3.connect(folder / "other.db3") as connection:

@@ -20,7 +20,7 @@ from tests.builders.messages import Unit, merged, messages
 from tests.builders.points import OUSTER, STAMP_NS, Form, cloud_message, write_points
 from tests.builders.rosbag1 import write_rosbag1
 from tests.builders.rosbag2 import write_rosbag2
-from tests.builders.sessions_of_bags import packets_only, told
+from tests.builders.sessions_of_bags import packets_only, session_of
 from tests.builders.traffic import Datagram, datagrams_of, read_pcap
 from tests.matrix.containers import CONTAINERS as MATRIX_CONTAINERS
 from tests.matrix.containers import SCAN_NS, rig_text
@@ -66,9 +66,9 @@ def write_recordings(folder: Path) -> None:
     _livox(folder / "livox")
     _clouds(folder / "clouds")
     # Packets, metadata, transforms and an IMU, as drivers record them.
-    write_mcap(folder / "bag_mcap" / "drive.mcap", told("cdr"))
-    write_rosbag2(folder / "bag_db3" / "drive.db3", told("cdr"))
-    write_rosbag1(folder / "bag_ros1" / "drive.bag", told("ros1"))
+    write_mcap(folder / "bag_mcap" / "drive.mcap", session_of("cdr"))
+    write_rosbag2(folder / "bag_db3" / "drive.db3", session_of("cdr"))
+    write_rosbag1(folder / "bag_ros1" / "drive.bag", session_of("ros1"))
 
 
 def rig_of(recording: str, container: str) -> str:

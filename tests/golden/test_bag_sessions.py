@@ -24,8 +24,8 @@ from tests.builders.run import TWO_LIDARS, Told, command, load, scan_files
 from tests.builders.sessions import NS_PER_MS, NS_PER_S, SMALL, Unit, twin
 from tests.builders.sessions_of_bags import (
     description,
+    session_of,
     split_at,
-    told,
     unit_messages,
     urdf,
 )
@@ -36,11 +36,13 @@ Write = Callable[[Path], Path]
 WHOLE_SCANS = 7
 COLUMNS = 1024
 SESSIONS: dict[str, Write] = {
-    "MCAP": lambda folder: write_mcap(folder / "drive.mcap", told()),
-    "db3 with types": lambda folder: write_rosbag2(folder / "drive.db3", told(), Form(schema=4)),
-    "db3 without types": lambda folder: write_rosbag2(folder / "drive.db3", told()),
-    "split db3": lambda folder: write_folder(folder / "drive", split_at(told(), 3)),
-    "ROS 1": lambda folder: write_rosbag1(folder / "drive.bag", told("ros1"), "lz4"),
+    "MCAP": lambda folder: write_mcap(folder / "drive.mcap", session_of()),
+    "db3 with types": lambda folder: write_rosbag2(
+        folder / "drive.db3", session_of(), Form(schema=4)
+    ),
+    "db3 without types": lambda folder: write_rosbag2(folder / "drive.db3", session_of()),
+    "split db3": lambda folder: write_folder(folder / "drive", split_at(session_of(), 3)),
+    "ROS 1": lambda folder: write_rosbag1(folder / "drive.bag", session_of("ros1"), "lz4"),
 }
 
 
@@ -131,7 +133,7 @@ def test_every_container_teaches_the_same(name: str, plain: Made, tmp_path: Path
 def test_split_files_may_be_given_one_by_one(plain: Made, tmp_path: Path) -> None:
     parts = [
         write_rosbag2(tmp_path / f"{number}.db3", part)
-        for number, part in enumerate(split_at(told(), 3))
+        for number, part in enumerate(split_at(session_of(), 3))
     ]
     # Times decide, not names or order.
     assert convert(tmp_path / "scans", *reversed(parts)).files == plain.files
@@ -139,7 +141,7 @@ def test_split_files_may_be_given_one_by_one(plain: Made, tmp_path: Path) -> Non
 
 @pytest.mark.parametrize(("x_m", "warns"), [(0.3, False), (0.3009, False), (0.35, True)])
 def test_a_contradicting_urdf_is_told(x_m: float, warns: bool, plain: Made, tmp_path: Path) -> None:
-    messages = told()
+    messages = session_of()
     messages.insert(0, description(urdf(x_m), messages[0].log_ns))
     made = convert(tmp_path / "scans", write_mcap(tmp_path / "drive.mcap", messages), "-v")
     assert "extrinsics from tf_static: base_link -> left/os_sensor\n" in made.told.out
@@ -152,7 +154,7 @@ def test_a_contradicting_urdf_is_told(x_m: float, warns: bool, plain: Made, tmp_
 
 def test_packets_in_a_capture_and_the_rest_in_a_bag(plain: Made, tmp_path: Path) -> None:
     shutil.copy(TWO_LIDARS / "two_lidars.pcap", tmp_path / "drive.pcap")
-    others = [one for one in told() if "packets" not in one.topic]
+    others = [one for one in session_of() if "packets" not in one.topic]
     bag = write_rosbag2(tmp_path / "knows.db3", others)
     made = convert(tmp_path / "scans", tmp_path / "drive.pcap", bag)
     assert made.told.err == ""
@@ -175,7 +177,7 @@ def imu_of(path: Path) -> list[tuple[int, bytes]]:
 def test_imu_messages_are_written_at_their_own_stamps(mcap: Path, tmp_path: Path) -> None:
     done = command("convert", mcap, "-o", tmp_path / "scans.mcap")
     assert (done.code, done.err) == (0, "")
-    sent = [one for one in told() if one.topic == "/imu/data"]
+    sent = [one for one in session_of() if one.topic == "/imu/data"]
     # Stamp and log time are the same there.
     assert imu_of(tmp_path / "scans.mcap") == [(one.log_ns, one.data) for one in sent]
 
@@ -267,7 +269,7 @@ def test_passed_topics_keep_their_bytes(mcap: Path, tmp_path: Path) -> None:
     with (tmp_path / "scans.mcap").open("rb") as file:
         topics = ["/left/ouster/metadata", "/right/ouster/metadata"]
         found = {c.topic: m.data for _, c, m in make_reader(file).iter_messages(topics)}
-    sent = {one.topic: one.data for one in told() if one.topic.endswith("/metadata")}
+    sent = {one.topic: one.data for one in session_of() if one.topic.endswith("/metadata")}
     assert found == sent
     (length,) = struct.unpack_from("<I", found[topics[0]], 4)
     assert json.loads(found[topics[0]][8 : 8 + length - 1])["sensor_info"]["prod_sn"] == LEFT.serial

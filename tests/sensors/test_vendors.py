@@ -1,4 +1,4 @@
-"""The folders of vendors: whom a packet may come from, told without the plug-ins.
+"""The folders of vendors: whom a packet may come from, without the plug-ins.
 
 Packets and files of all kinds, damaged ones too: the targets of `tests/fuzz/packets.py`.
 """
