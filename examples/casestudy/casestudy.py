@@ -1,6 +1,6 @@
 """The case study of the paper on simulated forests: one and two lidars, every N-th scan.
 
-    python casestudy.py                      # `make casestudy`: everything, an hour or two
+    python casestudy.py                      # `make casestudy`: everything
     python casestudy.py --seeds 1 --duration 40
     python casestudy.py --recordings drives  # write the recordings for other programs, run nothing
 
