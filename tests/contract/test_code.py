@@ -67,9 +67,14 @@ def _tests_of(plugin: Module) -> list[Path]:
     package, *_, name = plugin.name.split(".")
     if package == "sensors":
         return sorted((ROOT / "tests" / Path(*plugin.name.split(".")[:2])).glob("test_*.py"))
-    row = re.compile(
-        rf"""test_{name}|write_{name}|\.formats\.{name}\b|["(]{name}["(]|--format {name}\b"""
+    # A row of a table, or one of several values; a key of an array, ["xyz"], is neither.
+    words = (
+        rf"test_{name}",
+        rf"write_{name}\b",
+        rf"\.formats\.{name}\b",
+        rf'"{name}"(?=: [_{{]|,)',
     )
+    row = re.compile("|".join(words))
     files = sorted((ROOT / "tests" / package).rglob("test_*.py"))
     return [path for path in files if row.search(path.name) or row.search(_text(path))]
 
