@@ -1,0 +1,1 @@
+"""Where the lidars are: poses compared with what the lidars see of the same surfaces."""

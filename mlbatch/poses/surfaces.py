@@ -1,0 +1,149 @@
+"""Flat pieces of surfaces in the cells of a grid, and their distances between two clouds.
+
+Two clouds that see one wall have a plane each in the cells that it crosses. How far one plane is
+from the other, along the normal, is one observation of their relative pose (as between
+distributions: T. Stoyanov et al., 2012), whose variance follows from noise, number and spread of
+the points.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from mlbatch.arrays import BoolArray, F64Array, I64Array
+from mlbatch.motion.voxels import voxel_keys
+
+# A cell with fewer points has no reliable plane.
+_LEAST_POINTS = 8
+# A plane: least standard deviation along it, in edges; most across it, m, and as a share of the
+# variance along it.
+_LEAST_SPREAD = 0.12
+_MOST_THICK_M = 0.06
+_FLAT = 0.04
+# Roughness of surfaces and of the model of a lidar, m.
+_FLOOR_M = 0.004
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Planes:
+    """Planes of k cells of a cloud.
+
+    key: (k,), increasing; mean_m: (k, 3); time_s: (k,), mean of the points'; normal: (k, 3);
+    spread: (k, 3, 3), of the error of the plane across itself: variance at distance d from the
+    mean is noise + d' spread d, m2; noise: (k,), m2.
+    """
+
+    key: I64Array
+    mean_m: F64Array
+    time_s: F64Array
+    normal: F64Array
+    noise: F64Array
+    spread: F64Array
+
+    def take(self, rows: I64Array | BoolArray) -> Planes:
+        """Some of the planes."""
+        return Planes(
+            self.key[rows],
+            self.mean_m[rows],
+            self.time_s[rows],
+            self.normal[rows],
+            self.noise[rows],
+            self.spread[rows],
+        )
+
+    def variance(self, at_m: F64Array) -> F64Array:
+        """Variance (k,) of each plane across itself at points (k, 3), m2."""
+        off_m = at_m - self.mean_m
+        found: F64Array = self.noise + np.einsum("ki,kij,kj->k", off_m, self.spread, off_m)
+        return found
+
+
+def planes(points_m: F64Array, time_s: F64Array, edge_m: float) -> Planes:
+    """Planes of points (n, 3) with times (n,), in cells of an edge."""
+    key = voxel_keys(points_m, edge_m)
+    order = np.argsort(key, kind="stable")
+    key = key[order]
+    first = np.flatnonzero(np.concatenate([np.ones(min(1, len(key)), bool), key[1:] != key[:-1]]))
+    count = np.diff(first, append=len(key))
+    enough = count >= _LEAST_POINTS
+    kept = np.repeat(enough, count)
+    points_m, time_s = points_m[order[kept]], time_s[order[kept]]
+    key, count = key[first[enough]], count[enough]
+    if not len(key):
+        return Planes(key, *(np.zeros((0, *shape)) for shape in ((3,), (), (3,), (), (3, 3))))
+    start = np.cumsum(count) - count
+    base_m = points_m[start]
+    local = points_m - np.repeat(base_m, count, axis=0)
+    x, y, z = local.T
+    rows = np.stack([x, y, z, x * x, x * y, x * z, y * y, y * z, z * z, time_s], axis=1)
+    means = np.add.reduceat(rows, start, axis=0) / count[:, None]
+    mean = means[:, :3]
+    square = means[:, [3, 4, 5, 4, 6, 7, 5, 7, 8]].reshape(-1, 3, 3)
+    variance, axes = np.linalg.eigh(square - mean[:, :, None] * mean[:, None, :])
+    across, along, _ = np.maximum(variance, 0.0).T
+    is_plane = along >= (_LEAST_SPREAD * edge_m) ** 2
+    is_plane &= across <= np.minimum(_FLAT * along, _MOST_THICK_M**2)
+    variance, axes, count = variance[is_plane], axes[is_plane], count[is_plane]
+    noise = np.maximum(variance[:, 0], _FLOOR_M**2) / (count - 3)
+    # Of the tilt about each axis along the plane: noise by the spread of the points on it.
+    tilt = axes[:, :, 1:] * np.sqrt(noise[:, None] / variance[:, 1:])[:, None, :]
+    return Planes(
+        key[is_plane],
+        (base_m + mean)[is_plane],
+        means[is_plane, 9],
+        np.ascontiguousarray(axes[:, :, 0]),
+        noise + _FLOOR_M**2,
+        np.matmul(tilt, tilt.transpose(0, 2, 1)),
+    )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Distances:
+    """Distances between the planes of two clouds, m rows.
+
+    key: (m,), of the cell; normal: (m, 3); at_m: (m, 3), between the two planes; distance_m: (m,),
+    from the first to the second along the normal; sigma_m: (m,), its standard deviation;
+    time_s: (m, 2), of both.
+    """
+
+    key: I64Array
+    normal: F64Array
+    at_m: F64Array
+    distance_m: F64Array
+    sigma_m: F64Array
+    time_s: F64Array
+
+    def __len__(self) -> int:
+        return len(self.key)
+
+
+def shared_cells(first: Planes, second: Planes) -> tuple[I64Array, I64Array]:
+    """Rows of both in which they have a plane in the same cell."""
+    _, left, right = np.intersect1d(first.key, second.key, assume_unique=True, return_indices=True)
+    return left, right
+
+
+def distances(first: Planes, second: Planes, parallel: float, most_m: float) -> Distances:
+    """Compare the planes of two clouds in the cells that they share.
+
+    parallel: least cosine between normals; most_m: largest distance.
+    """
+    left, right = shared_cells(first, second)
+    first, second = first.take(left), second.take(right)
+    cosine = (first.normal * second.normal).sum(axis=1)
+    normal = first.normal + np.sign(cosine)[:, None] * second.normal
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True) + 1e-12
+    at_m = (first.mean_m + second.mean_m) / 2
+    distance_m = (normal * (second.mean_m - first.mean_m)).sum(axis=1)
+    variance = first.variance(at_m) + second.variance(at_m)
+    kept = (np.abs(cosine) >= parallel) & (np.abs(distance_m) <= most_m)
+    return Distances(
+        first.key[kept],
+        normal[kept],
+        at_m[kept],
+        distance_m[kept],
+        np.sqrt(variance[kept]),
+        np.stack([first.time_s, second.time_s], axis=1)[kept],
+    )
