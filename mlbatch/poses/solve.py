@@ -197,6 +197,21 @@ def solve(problem: Problem, state: State, level: Level, most_steps: int = 25) ->
     return Solution(state, covariance, weak, equations.matched(), equations.rms, converged)
 
 
+def find_poses(
+    places: Sequence[Place], lidars: int, *, delays: bool = False, guess: State | None = None
+) -> Solution:
+    """Solve for the poses of all lidars, coarse to fine.
+
+    guess: where to start, else the poses that the points were converted with; up to 20 degrees and
+    1 m off.
+    """
+    state = guess or State.start(lidars, len(places))
+    problem = Problem(places, lidars)
+    for level in LEVELS[:-1]:
+        state = solve(problem, state, level).state
+    return solve(Problem(places, lidars, delays=delays), state, LEVELS[-1])
+
+
 def _is_small(problem: Problem, step: F64Array) -> bool:
     six = step[: problem.poses].reshape(-1, problem.each) if problem.poses else np.zeros((0, 6))
     return bool((np.abs(six[:, :3]) < _STEP_M).all() and (np.abs(six[:, 3:6]) < _STEP_RAD).all())
