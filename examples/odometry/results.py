@@ -55,8 +55,8 @@ def table_lines(found: Mapping[str, Mapping[int, Errors]], base: str) -> list[st
     """Return a Markdown table: medians with intervals, and ratios to `base` by seed."""
     lines = [
         "| input of KISS-ICP | RPE, mm | RPE, degrees | APE, mm | ratio RPE | ratio rotation "
-        "| worse in | offset, ms |",
-        "|---|---|---|---|---|---|---|---|",
+        "| worse in | offset, ms | at own stamps: ratio RPE | ratio rotation |",
+        "|---|---|---|---|---|---|---|---|---|---|",
     ]
     for variant, seeds in found.items():
         errors = list(seeds.values())
@@ -75,6 +75,12 @@ def table_lines(found: Mapping[str, Mapping[int, Errors]], base: str) -> list[st
             worse = sum(ratio > 1.0 for ratio in ratios)
             cells += [_cell(ratios, 2), _cell(turns, 2), f"{worse} of {len(ratios)}"]
         cells.append(_cell([1000.0 * one.offset_s for one in errors], 0))
+        if variant == base:
+            cells += ["1", "1"]
+        else:
+            ratios = [one.at_stamp_rpe_m / other.at_stamp_rpe_m for one, other in pairs]
+            turns = [one.at_stamp_rpe_deg / other.at_stamp_rpe_deg for one, other in pairs]
+            cells += [_cell(ratios, 2), _cell(turns, 2)]
         lines.append(f"| {' | '.join(cells)} |")
     return [*lines, "", statement([len(seeds) for seeds in found.values()])]
 
