@@ -20,6 +20,7 @@ FLOORS: tuple[tuple[str, ...], ...] = (
     ("outputs",),
     ("readers", "sensors", "writers", "faults"),
     ("decode", "batching"),
+    ("poses",),
     ("report", "rig", "clocks", "motion"),
     ("lidar", "frames", "ros"),
     ("types",),
