@@ -10,11 +10,13 @@ from collections.abc import Collection, Sequence
 from enum import Enum
 from typing import NamedTuple
 
-from mlbatch.arrays import U8Array
-from mlbatch.discovery.sampler import are_neighbours
+import numpy as np
+
+from mlbatch.arrays import I64Array, U8Array
+from mlbatch.discovery.sampler import are_neighbours, split_by_kind
 from mlbatch.discovery.types import DetectedSensor, PacketKind
 from mlbatch.rig.rig import StreamSelector
-from mlbatch.types import Stream, StreamTable
+from mlbatch.types import PacketBatch, Stream, StreamTable
 
 
 class Role(Enum):
@@ -61,6 +63,26 @@ class Router:
                 self._forget_unassigned()
             self._routes[kind] = route
         return route
+
+    def route_of(self, kind: PacketKind, batch: PacketBatch, row: int) -> Route:
+        """Route of a kind; row: one of its packets in a batch."""
+        begin = int(batch.start[row])
+        return self.route(kind, batch.data[begin : begin + kind.size])
+
+    def owners(self, batch: PacketBatch) -> I64Array:
+        """Index of the sensor that sent each packet, IMU packets included; -1: no sensor."""
+        owner = np.full(len(batch), -1, np.int64)
+        for kind, index in split_by_kind(batch):
+            route = self.route_of(kind, batch, int(index[0]))
+            if route.role in (Role.IMU, Role.BAD_SIZE):
+                owner[index] = route.sensors[0]
+                continue
+            for number in route.sensors:
+                lidar = self._sensors[number].lidar
+                left = index[owner[index] < 0]
+                packets = batch.data[batch.start[left, None] + np.arange(lidar.packet_size)]
+                owner[left[lidar.sent_by_me(packets)]] = number
+        return owner
 
     def _forget_unassigned(self) -> None:
         """Let kinds of no sensor be decided again, by their next packets."""

@@ -59,7 +59,7 @@ class ClockMonitor:
         ]
         ingest = Ingest(router, sensors, intakes, self.map_stamps)
         if self._replay is not None:
-            batches = self._replay.batches(batches, ingest.owners)
+            batches = self._replay.batches(batches, router.owners)
         for batch in batches:
             arena.keep_from(None)
             ingest.columns(batch)

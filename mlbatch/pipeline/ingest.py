@@ -107,7 +107,7 @@ class Ingest:
         shared: list[tuple[PacketKind, I64Array]] = []
         unassigned: list[tuple[PacketKind, I64Array]] = []
         for kind, index in split_by_kind(batch):
-            route = self._router.route(kind, _payload(batch, int(index[0]), kind))
+            route = self._router.route_of(kind, batch, int(index[0]))
             if route.role is Role.LIDAR:
                 shared.append((kind, index))
                 for number in route.sensors:
@@ -131,21 +131,6 @@ class Ingest:
         for kind, index in self.kind_filter.followed(batch, left):
             self._unassign(kind, batch, index)
         return ingested
-
-    def owners(self, batch: PacketBatch) -> I64Array:
-        """Index of the sensor that sent each packet, IMU packets included; -1: no sensor."""
-        owner = np.full(len(batch), -1, np.int64)
-        for kind, index in split_by_kind(batch):
-            route = self._router.route(kind, _payload(batch, int(index[0]), kind))
-            if len(route.sensors) == 1:
-                owner[index] = route.sensors[0]
-                continue
-            for number in route.sensors:
-                lidar = self._sensors[number].lidar
-                left = index[owner[index] < 0]
-                packets = batch.data[batch.start[left, None] + np.arange(lidar.packet_size)]
-                owner[left[lidar.sent_by_me(packets)]] = number
-        return owner
 
     def _unassign(self, kind: PacketKind, batch: PacketBatch, index: I64Array) -> None:
         if self._is_ignored is None:
@@ -222,12 +207,6 @@ class Ingest:
         fresh = np.zeros(len(keys), np.bool_)
         fresh[first] = True
         return fresh[len(keys) - len(key) :]
-
-
-def _payload(batch: PacketBatch, number: int, kind: PacketKind) -> U8Array:
-    """Payload of one packet of a kind."""
-    begin = int(batch.start[number])
-    return batch.data[begin : begin + kind.size]
 
 
 def _headers(lidar: Lidar, packets: Payloads, host_ns: I64Array) -> Headers:

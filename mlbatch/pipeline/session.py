@@ -144,7 +144,7 @@ class Session:
         with contextlib.closing(self.setup.first.whole(is_without_packets, seen)) as merged:
             batches: Iterator[PacketBatch] = merged
             if self.replay is not None:
-                batches = self.replay.batches(batches, self.ingest.owners)
+                batches = self.replay.batches(batches, self.setup.router.owners)
             for batch in batches:
                 self._count(batch)
                 yield batch

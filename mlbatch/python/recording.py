@@ -253,12 +253,11 @@ class Recording:
         streams = session.setup.sampler.table.streams
         with contextlib.closing(session.packets()) as batches:
             for batch in batches:
-                owner = session.ingest.owners(batch)
+                owner = session.setup.router.owners(batch)
                 # Some sources append a byte, which the lidar does not send.
                 is_lidar = (batch.size == size) | (batch.size == size + 1)
                 rows = np.flatnonzero((owner == number) & is_lidar)
-                packets = batch.data[batch.start[rows, None] + np.arange(size)]
-                for row in rows[lidar.sent_by_me(packets)].tolist():
+                for row in rows.tolist():
                     begin = int(batch.start[row])
                     data = batch.data[begin : begin + int(batch.size[row])].tobytes()
                     stream = streams[int(batch.stream[row])]

@@ -22,7 +22,7 @@ from mlbatch.readers.source import read_head
 from mlbatch.types import Recording, StreamTable, Topic
 
 if TYPE_CHECKING:
-    from mlbatch.readers.bag.packet_messages import Envelope
+    from mlbatch.ros.packet_types import Envelope
 
 __all__ = [
     "CORRECTION_TYPE",
@@ -106,8 +106,8 @@ def has_corrections(topic: Topic) -> bool:
 
 def _envelope(topic: Topic) -> Envelope | None:
     # Not loaded for captures, which have no topics.
-    from mlbatch.readers.bag.packet_messages import PACKET_TYPES
     from mlbatch.ros.definitions import type_key
+    from mlbatch.ros.packet_types import PACKET_TYPES
 
     return PACKET_TYPES.get(type_key(topic.type))
 

@@ -76,11 +76,11 @@ class Sent:
 
 @dataclass(frozen=True, slots=True)
 class PacketTopic:
-    """Topic and message type of the packets of a port in bags; flag: `is_difop` of RoboSense."""
+    """Topic and message type of the packets of a port in bags; of_device: as `PacketMessages`."""
 
     name: str
     message: str
-    flag: int = 0
+    of_device: bool = False
 
 
 @dataclass(frozen=True, slots=True, eq=False)

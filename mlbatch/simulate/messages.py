@@ -1,113 +1,20 @@
-"""ROS 2 messages of a simulated recording: packets, IMU samples, ground truth (CDR).
+"""ROS 2 messages of a simulated recording: IMU samples, ground truth (CDR).
 
 Types: docs/sources/messages.md, section 1.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 
 from mlbatch.arrays import F64Array
 from mlbatch.frames.transforms import quaternion
 from mlbatch.ros.encoding import Cdr
-from mlbatch.simulate.interface import PacketTopic
 from mlbatch.simulate.trajectory import Poses
-from mlbatch.units import NS_PER_S
 
 TF = "/tf"
 TF_STATIC = "/tf_static"
-# Messages with many packets contain those of a tenth of a second.
-_GROUP_NS = NS_PER_S // 10
 _UNKNOWN = (-1.0, *(0.0,) * 8)
-
-
-@dataclass(frozen=True, slots=True)
-class Stamped:
-    """A packet with its receive time."""
-
-    host_ns: int
-    payload: bytes
-
-
-# Packets, frame and topic to the message.
-Encode = Callable[[Sequence[Stamped], str, PacketTopic], bytes]
-
-
-def _packet(packets: Sequence[Stamped], frame: str, topic: PacketTopic) -> bytes:
-    message = Cdr()
-    message.put("I", len(packets[0].payload))
-    return bytes(message.data) + packets[0].payload
-
-
-def _velodyne(packets: Sequence[Stamped], frame: str, topic: PacketTopic) -> bytes:
-    message = Cdr()
-    message.header(packets[-1].host_ns, frame)
-    message.put("I", len(packets))
-    for packet in packets:
-        _stamp(message, packet.host_ns)
-        message.data += packet.payload
-    return bytes(message.data)
-
-
-def _hesai(packets: Sequence[Stamped], frame: str, topic: PacketTopic) -> bytes:
-    message = Cdr()
-    message.header(packets[-1].host_ns, frame)
-    message.put("I", len(packets))
-    for packet in packets:
-        _stamp(message, packet.host_ns)
-        message.put("I", len(packet.payload))
-        message.data += packet.payload
-        message.put("I", len(packet.payload))
-    return bytes(message.data)
-
-
-def _robosense(packets: Sequence[Stamped], frame: str, topic: PacketTopic) -> bytes:
-    message = Cdr()
-    message.header(packets[0].host_ns, frame)
-    message.put("B", topic.flag, 0)
-    message.put("I", len(packets[0].payload))
-    return bytes(message.data) + packets[0].payload
-
-
-def _stamp(message: Cdr, time_ns: int) -> None:
-    message.put("i", time_ns // NS_PER_S)
-    message.put("I", time_ns % NS_PER_S)
-
-
-# Encoder by message type, and whether a message has many packets.
-_ENCODE: Mapping[str, tuple[Encode, bool]] = {
-    "ouster_sensor_msgs/PacketMsg": (_packet, False),
-    "velodyne_msgs/VelodyneScan": (_velodyne, True),
-    "hesai_ros_driver/UdpFrame": (_hesai, True),
-    "rslidar_msg/RslidarPacket": (_robosense, False),
-}
-
-
-class PacketMessages:
-    """Messages of the packets of one port, in the order of their receive times."""
-
-    def __init__(self, topic: PacketTopic, frame: str) -> None:
-        """frame: of the headers."""
-        self.topic = topic
-        self._frame = frame
-        self._encode, self._has_many = _ENCODE[topic.message]
-        self._waiting: list[Stamped] = []
-
-    def add(self, packet: Stamped) -> bytes | None:
-        """Return the message that a packet completes, of its receive time; None if it waits."""
-        self._waiting.append(packet)
-        if self._has_many and packet.host_ns - self._waiting[0].host_ns < _GROUP_NS:
-            return None
-        return self.rest()
-
-    def rest(self) -> bytes | None:
-        """Return a message with the packets that wait; None if there are none."""
-        if not self._waiting:
-            return None
-        message = self._encode(self._waiting, self._frame, self.topic)
-        self._waiting = []
-        return message
 
 
 def text_message(text: str) -> bytes:

@@ -18,21 +18,11 @@ import numpy as np
 
 from mlbatch.errors import UsageError
 from mlbatch.frames.transforms import quaternion, rpy_deg
-from mlbatch.simulate.containers import (
-    MCAP,
-    PCAP,
-    SUFFIXES,
-    Bag,
-    McapFile,
-    PcapFile,
-    SqliteFile,
-)
+from mlbatch.ros.packet_writing import PacketMessages, Stamped
 from mlbatch.simulate.lidar_stream import LidarStream, Received, SensorClock, with_errors
 from mlbatch.simulate.messages import (
     TF,
     TF_STATIC,
-    PacketMessages,
-    Stamped,
     imu_message,
     odometry_message,
     static_message,
@@ -41,9 +31,12 @@ from mlbatch.simulate.messages import (
 )
 from mlbatch.simulate.scenario import Scenario
 from mlbatch.simulate.trajectory import Poses
+from mlbatch.types import Message, Topic
 from mlbatch.units import NS_PER_S
 from mlbatch.writers.atomic import Output, discard, export_errors, prepare
+from mlbatch.writers.recordings import MCAP, PCAP, SQLITE, Bag, PcapFile, new_bag
 
+SUFFIXES = (PCAP, MCAP, SQLITE)
 _STEP_S = 0.1
 _KEPT_BYTES = 24 << 20
 # From an IMU sample to its message.
@@ -159,13 +152,16 @@ class _Run:
         self._truth = truth
         self._samples = samples
         self._pcap = PcapFile(path) if suffix == PCAP else None
-        self._bag: Bag | None = None
-        if suffix != PCAP:
-            self._bag = McapFile(path) if suffix == MCAP else SqliteFile(path)
+        self._bag: Bag | None = None if suffix == PCAP else new_bag(path, suffix)
         self._messages: dict[tuple[int, int], PacketMessages] = {}
         for index, stream in enumerate(streams):
             for port, topic in stream.lidar.topics.items():
-                self._messages[index, port] = PacketMessages(topic, stream.plan.name)
+                name = f"/{stream.plan.name}/{topic.name}"
+                self._messages[index, port] = PacketMessages(
+                    Topic(name, topic.message, "cdr"),
+                    stream.plan.name,
+                    of_device=topic.of_device,
+                )
         self._last_ns = scenario.start_ns
         self.imu_samples = 0
         self.poses = 0
@@ -209,13 +205,15 @@ class _Run:
             self._pcap.packet(one.host_ns, address, one.port, one.payload)
         messages = self._messages.get((index, one.port))
         if self._bag is not None and messages is not None:
-            data = messages.add(Stamped(one.host_ns, one.payload))
-            self._send(index, messages, one.host_ns, data)
+            for message in messages.add(Stamped(one.host_ns, one.payload)):
+                self._bag.forward(message)
 
-    def _send(self, index: int, messages: PacketMessages, host_ns: int, data: bytes | None) -> None:
-        if self._bag is not None and data is not None:
-            topic = f"/{self._streams[index].plan.name}/{messages.topic.name}"
-            self._bag.message(topic, messages.topic.message, host_ns, data)
+    def _send(
+        self, topic: str, kind: str, host_ns: int, data: bytes, *, latched: bool = False
+    ) -> None:
+        """Write a message of type `kind`, package/Type, if the recording is a bag."""
+        if self._bag is not None:
+            self._bag.forward(Message(Topic(topic, kind, "cdr", latched=latched), host_ns, data))
 
     def _inertial(self, end_s: float) -> list[_Event]:
         """Return the samples of the body's IMU up to a time."""
@@ -258,7 +256,7 @@ class _Run:
         self._samples.write(f"{stamp_ns},{values}\n")
         if self._bag is not None:
             data = imu_message(stamp_ns, plan.name, force, rate)
-            self._bag.message(plan.topic, "sensor_msgs/Imu", host_ns, data)
+            self._send(plan.topic, "sensor_msgs/Imu", host_ns, data)
 
     def _poses(self, end_s: float) -> list[_Event]:
         """Return the poses of the ground truth up to a time; the last step includes its end."""
@@ -293,7 +291,7 @@ class _Run:
         encode = transform_message if is_transform else odometry_message
         kind = "tf2_msgs/TFMessage" if is_transform else "nav_msgs/Odometry"
         data = encode(host_ns, plan.frame, self._scenario.body_frame, poses, row)
-        self._bag.message(plan.topic, kind, host_ns, data)
+        self._send(plan.topic, kind, host_ns, data)
 
     def _write_metadata(self) -> None:
         """Write the latched messages with the calibrations, and the place of the body's IMU."""
@@ -304,21 +302,22 @@ class _Run:
         if imu is not None:
             body = self._scenario.body_frame
             data = static_message(start_ns, body, imu.name, imu.body_from_imu)
-            self._bag.message(TF_STATIC, "tf2_msgs/TFMessage", start_ns, data, True)
+            self._send(TF_STATIC, "tf2_msgs/TFMessage", start_ns, data, latched=True)
         for stream in self._streams:
             files = stream.lidar.files
             if files.topic:
                 topic = f"/{stream.plan.name}/{files.topic}"
                 data = text_message(files.content.decode())
-                self._bag.message(topic, "std_msgs/String", start_ns, data, True)
+                self._send(topic, "std_msgs/String", start_ns, data, latched=True)
 
     def _close(self) -> None:
         """Write the packets that wait for others, complete the file."""
         if self._pcap is not None:
             self._pcap.close()
         if self._bag is not None:
-            for (index, _), messages in self._messages.items():
-                self._send(index, messages, self._last_ns, messages.rest())
+            for messages in self._messages.values():
+                for message in messages.rest(self._last_ns):
+                    self._bag.forward(message)
             self._bag.close()
 
 

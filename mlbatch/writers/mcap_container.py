@@ -324,6 +324,11 @@ class McapContainer:
         self._complete()
         return self._file.crc
 
+    def close(self) -> None:
+        """Complete and close a file that is no output of a run: without metadata of one."""
+        self._write_all_chunks()
+        self._complete()
+
     def _complete(self) -> None:
         self._write_summary()
         self._file.complete()

@@ -27,10 +27,11 @@ from typing import Final
 import numpy as np
 
 from mlbatch.arrays import F64Array
-from mlbatch.simulate.containers import McapFile
 from mlbatch.simulate.interface import LidarSettings, Sent, SimulatedLidar
 from mlbatch.simulate.models import simulated_lidar
+from mlbatch.types import Message, Topic
 from mlbatch.units import NS_PER_MS, NS_PER_S, NS_PER_US, STANDARD_GRAVITY
+from mlbatch.writers.recordings import McapFile
 from tests.bench.cases import (
     BY_RING,
     CLOUD_COLUMNS,
@@ -159,7 +160,7 @@ def write_clouds(path: Path, sensors: Sequence[BenchSensor], seconds: float) -> 
             # The stamp follows the head of CDR.
             struct.pack_into("<II", body, 4, *divmod(stamp_ns, NS_PER_S))
             log_ns = stamp_ns + REVOLUTION_NS + _CLOUD_TRAVEL_NS
-            file.message(sensor.topic, CLOUD, log_ns, bytes(body))
+            file.forward(Message(Topic(sensor.topic, CLOUD, "cdr"), log_ns, bytes(body)))
     file.close()
 
 

@@ -25,11 +25,11 @@ from mlbatch.pipeline.job import Job
 from mlbatch.pipeline.run import convert
 from mlbatch.readers import readers, source
 from mlbatch.readers.bag import recording as bag_recording
-from mlbatch.readers.bag.packet_messages import PACKET_TYPES
 from mlbatch.readers.capture import recording as capture
 from mlbatch.report import ledger
 from mlbatch.report.report import build_report
 from mlbatch.rig import yaml_tree
+from mlbatch.ros.packet_types import PACKET_TYPES
 from mlbatch.sensors import MAX_CALIBRATION_BYTES, models
 from mlbatch.writers import format_names, formats
 from mlbatch.writers.point_layouts import CLOUD_LAYOUTS, PLY_LAYOUT

@@ -13,9 +13,9 @@ import numpy as np
 
 from mlbatch.discovery.first_seconds import FirstSeconds, with_clouds
 from mlbatch.frames.naming import Candidate
-from mlbatch.readers.bag.packet_messages import PACKET_TYPES
 from mlbatch.readers.bag.recording import BagRecording, Portion
 from mlbatch.ros.definitions import definition_text
+from mlbatch.ros.packet_types import PACKET_TYPES
 from mlbatch.types import StreamTable, Topic
 from tests.builders import points
 from tests.builders.bags import Body, Recorded, definition, packet_message, transforms_message

@@ -17,7 +17,7 @@ from mlbatch.discovery.discover import SensorSelection
 from mlbatch.frames.naming import NAMINGS
 from mlbatch.pipeline.job import Job
 from mlbatch.readers import open_recording
-from mlbatch.readers.bag.packet_messages import PACKET_TYPES
+from mlbatch.ros.packet_types import PACKET_TYPES
 from mlbatch.types import StreamTable
 from tests.builders.captures import (
     SLL2,

@@ -1,13 +1,13 @@
-"""Messages with raw packets of lidars: their types, and where the packets are, many at once.
+"""Where the packets are in messages with raw packets of lidars, many at once.
 
-Types, stamps and traps: docs/sources/messages.md, sections 1 to 4. A message is walked field by
+Stamps and traps: docs/sources/messages.md, sections 1 to 4. A message is walked field by
 field once per shape: the lengths within a message determine all places, so that messages of the
 same length and the same lengths inside are read by adding the offsets of the first.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 
@@ -26,70 +26,12 @@ from mlbatch.ros.definitions import (
     variants_of,
 )
 from mlbatch.ros.encoding import ENCODINGS, EncapsulationError, MessageError, MessageReader
+from mlbatch.ros.packet_types import PACKET_TYPES, PADDED, Envelope
 from mlbatch.types import Topic
 from mlbatch.units import NS_PER_S
 
-# -- message types --------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True, slots=True)
-class Envelope:
-    """Position of payloads in a message type.
-
-    payload: field of the bytes; inside: field of the message(s) that contain it, "" for the message
-    itself; size: field with the number of valid bytes; stamp: field of the receive time at the
-    host; stamped_by: encodings whose drivers fill it; corrections: a calibration may be among the
-    packets; padded: short packets may be in a field of fixed length; may_lack_size: some
-    definitions have no `size`.
-    """
-
-    payload: str
-    inside: str = ""
-    size: str = ""
-    stamp: str = ""
-    stamped_by: tuple[str, ...] = ENCODINGS
-    corrections: bool = False
-    padded: bool = False
-    may_lack_size: bool = False
-
-
-_OUSTER = Envelope("buf")
-# The ROS 1 driver of pandar_msgs leaves its stamps empty, or fills them while replaying.
-_PANDAR = Envelope("data", size="size", stamp="stamp", stamped_by=("cdr",))
-_HESAI = Envelope("data", size="size", stamp="stamp")
-_OLD_ROBOSENSE = Envelope("data", stamp="stamp", padded=True)
-# A branch of Nebula has longer fields, with a size.
-_ROBOSENSE = replace(_OLD_ROBOSENSE, size="size", may_lack_size=True)
-
-PACKET_TYPES: Mapping[str, Envelope] = {
-    "ouster_ros/PacketMsg": _OUSTER,
-    "ouster_msgs/PacketMsg": _OUSTER,
-    "ouster_sensor_msgs/PacketMsg": _OUSTER,
-    "velodyne_msgs/VelodyneScan": Envelope("data", "packets", stamp="stamp"),
-    "velodyne_msgs/VelodynePacket": Envelope("data", stamp="stamp"),
-    "hesai_lidar/PandarScan": Envelope("data", "packets", "size", "stamp", corrections=True),
-    "hesai_lidar/PandarPacket": _HESAI,
-    "pandar_msgs/PandarScan": Envelope("data", "packets", "size", "stamp", ("cdr",)),
-    "pandar_msgs/PandarPacket": _PANDAR,
-    "pandar_msgs/PandarJumboPacket": _PANDAR,
-    "hesai_ros_driver/UdpFrame": Envelope("data", "packets", "size", "stamp"),
-    "hesai_ros_driver/UdpPacket": _HESAI,
-    "nebula_msgs/NebulaPackets": Envelope("data", "packets", stamp="stamp"),
-    "nebula_msgs/NebulaPacket": Envelope("data", stamp="stamp"),
-    # Its header has the sensor's time, or nothing.
-    "rslidar_msg/RslidarPacket": Envelope("data"),
-    "rslidar_msgs/rslidarScan": Envelope("data", "packets", stamp="stamp", padded=True),
-    "rslidar_msgs/rslidarPacket": _OLD_ROBOSENSE,
-    "robosense_msgs/RobosenseScan": replace(_ROBOSENSE, inside="packets"),
-    "robosense_msgs/RobosensePacket": _ROBOSENSE,
-    "robosense_msgs/RobosenseInfoPacket": replace(_ROBOSENSE, inside="packet"),
-    "udp_msgs/UdpPacket": Envelope("data"),
-}
-
 _CORRECTION_MAGIC = b"\x47\x74\x05\x00"
 _CORRECTION_HEAD_BYTES = 8
-# First bytes of RoboSense packets that are shorter than the field, and their length.
-_PADDED = ((b"\x55\xaa\x5a\xa5", 1210), (b"\xa5\xff\x00\x5a", 256))
 
 # -- shapes ---------------------------------------------------------------------------------------
 
@@ -459,7 +401,7 @@ def _begins_with(data: U8Array, start: I64Array, size: I64Array, magic: bytes) -
 def _unpadded(data: U8Array, start: I64Array, size: I64Array) -> I64Array:
     """Sizes without the zeros that fill a field up to its fixed length."""
     size = size.copy()
-    for magic, length in _PADDED:
+    for magic, length in PADDED:
         for at in _begins_with(data, start, size, magic).tolist():
             begin = int(start[at]) + length
             end = int(start[at] + size[at])

@@ -16,9 +16,10 @@ import numpy as np
 
 from mlbatch.arrays import I64Array, U8Array
 from mlbatch.readers import CORRECTION_TYPE
-from mlbatch.readers.bag.packet_messages import PACKET_TYPES, PacketsFound, Unpacker
+from mlbatch.readers.bag.packet_messages import PacketsFound, Unpacker
 from mlbatch.ros.definitions import type_key
 from mlbatch.ros.encoding import MessageError
+from mlbatch.ros.packet_types import PACKET_TYPES
 from mlbatch.types import (
     CaptureCounts,
     CutOff,

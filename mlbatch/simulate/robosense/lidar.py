@@ -75,7 +75,7 @@ class SimulatedRobosense:
         self.files = LidarFiles()
         self.topics = {
             MSOP_PORT: PacketTopic("rslidar_packets", _TYPE),
-            DIFOP_PORT: PacketTopic("rslidar_packets", _TYPE, flag=1),
+            DIFOP_PORT: PacketTopic("rslidar_packets", _TYPE, of_device=True),
         }
         self.imu: ImuUnit | None = None
         self._columns = np.arange(round(_CHUNK_PACKETS * self._spec.columns_per_packet))

@@ -41,7 +41,7 @@ def record_layout(options: WriterOptions) -> RecordLayout | None:
 
 def open_writer(target: Path, info: RunInfo, options: WriterOptions) -> ScanWriter:
     """Start a ROS 1 bag."""
-    return MessageWriter(target, info, options, Ros1, _Rosbag1File)
+    return MessageWriter(target, info, options, Ros1, Rosbag1File)
 
 
 class _OpenPath:
@@ -54,7 +54,7 @@ class _OpenPath:
         return self._file
 
 
-class _Rosbag1File:
+class Rosbag1File:
     """Connections and messages of one bag; `rosbags` writes each chunk when it is complete."""
 
     def __init__(self, path: Path) -> None:
@@ -104,6 +104,10 @@ class _Rosbag1File:
 
     def finish(self, summary: Summary, grid: dict[str, str]) -> None:
         """Complete and close the file; a bag has no place for metadata."""
+        self.close()
+
+    def close(self) -> None:
+        """Complete and close the file."""
         self._bag.close()
 
     def abandon(self) -> None:

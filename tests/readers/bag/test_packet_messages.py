@@ -14,9 +14,10 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from mlbatch.arrays import U8Array
 from mlbatch.errors import RecordingError
-from mlbatch.readers.bag.packet_messages import PACKET_TYPES, PacketsFound, Unpacker
+from mlbatch.readers.bag.packet_messages import PacketsFound, Unpacker
 from mlbatch.ros.definitions import definition_text
 from mlbatch.ros.encoding import MessageError
+from mlbatch.ros.packet_types import PACKET_TYPES
 from mlbatch.types import Topic
 from tests.builders.bags import Body
 
