@@ -1,4 +1,4 @@
-"""Poses of all lidars at once, by least squares over distances between surfaces.
+"""Poses of all lidars at once, by least squares over distances between surfaces and stems.
 
 A place is two or more windows that follow each other. Its clouds, one a lidar and window, are
 moved to one instant by a twist of their own, which is solved with the poses: distances between
@@ -9,7 +9,7 @@ a small motion of its points in the body frame, after the pose that they were co
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from itertools import combinations
 
 import numpy as np
@@ -17,28 +17,44 @@ import numpy as np
 from mlbatch.arrays import F64Array, I64Array
 from mlbatch.motion.registration import ORIGIN, Pose
 from mlbatch.motion.se3 import exp_rotation, exp_transform
-from mlbatch.poses.surfaces import Distances, Planes, distances, planes
+from mlbatch.poses.stems import Stems, stem_distances, stems
+from mlbatch.poses.surfaces import Distances, Planes, at_rows, distances, planes
 
 # Cauchy kernel: residuals of this many standard deviations have half of their weight.
 _KERNEL = 2.5
-# Observations this near to each other, and of one place, are not independent, m.
+# Observations this near to each other in the body frame are not independent, m.
 _BLOCK_M = 3.0
-# What a direction needs besides its standard deviation: a share of its observations whose normals
-# lie along it, as normals are not exact, and blocks that they come from.
-_ALONG = 0.15
-_FEWEST_BLOCKS = 6
-_STEP_M = 1e-4
-_STEP_RAD = 1e-5
+# A turn by 1 rad moves what is this far by as much, m.
+_LEVER_M = 10.0
+# What a direction needs to be determined: a standard deviation, m and (by _LEVER_M) rad; the share
+# of its information that is not noise of normals; blocks that the information comes from.
+_MOST_SIGMA_M = 0.005
+_TRUE_SHARE = 0.3
+_FEWEST_BLOCKS = 3.0
+# Errors of lidars that no scene shows, m and rad.
+_FLOOR_M, _FLOOR_RAD = 0.0005, 0.0001
+# A direction that is not determined, m.
+_UNKNOWN_M = 1.0
+# Twists of vehicles, standard deviations, m/s and rad/s.
+_SPEED_MPS, _TURN_RADPS = 15.0, 1.5
+# Damping: standard deviations of a step where nothing is seen, m and m/s; largest steps.
+_STEP_M, _STEP_MPS = 0.2, 1.0
+_LONGEST_M, _LONGEST_RAD = 0.5, 0.1
+_LONGEST_MPS, _LONGEST_RADPS = 5.0, 0.5
+# A step that changes poses by less ends the search.
+_SMALL_M, _SMALL_RAD = 1e-4, 1e-5
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Cloud:
     """Points of one lidar in one window: (n, 3) in the body frame, m, as measured; time_s: (n,),
-    from the instant of the place."""
+    from the instant of the place; origin_m: (3,), where the lidar is, as its points were converted
+    (without it stems are not compared)."""
 
     lidar: int
     points_m: F64Array
     time_s: F64Array
+    origin_m: F64Array | None = None
 
 
 # Clouds of windows that follow each other.
@@ -65,28 +81,42 @@ class State:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Level:
-    """How surfaces are matched: edge of cells, least cosine between normals, most distance."""
+    """How surfaces are matched: edge of cells, least cosine between normals, most distance.
+
+    points: most of a cloud that are used, about.
+    """
 
     edge_m: float
     parallel: float
     most_m: float
+    points: int = 1 << 40
 
 
 FINE = Level(0.5, 0.97, 0.15)
-LEVELS = (Level(2.0, 0.9, 1.0), Level(1.0, 0.94, 0.4), FINE)
+LEVELS = (Level(2.0, 0.9, 1.0, 20_000), Level(1.0, 0.94, 0.4, 40_000), FINE)
 
 
-@dataclass(slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False)
 class Rows:
-    """Weighted equations: jacobian (m, u), residual (m,) in standard deviations; block: (m,).
+    """Equations of a place: m distances in standard deviations.
 
-    pair: (m, 2), lidars of each.
+    jacobian: (m, poses + 6); noise: (m, poses + 6), its error by the noise of normals; residual:
+    (m,); block: (m,); pair: (m, 2), lidars.
     """
 
-    jacobian: list[F64Array] = field(default_factory=list)
-    residual: list[F64Array] = field(default_factory=list)
-    block: list[I64Array] = field(default_factory=list)
-    pair: list[I64Array] = field(default_factory=list)
+    jacobian: F64Array
+    noise: F64Array
+    residual: F64Array
+    block: I64Array
+    pair: I64Array
+
+    @property
+    def scale(self) -> float:
+        """Spread of the residuals; 1 or more."""
+        if not len(self.residual):
+            return 1.0
+        # Noise of real scenes exceeds that of the points.
+        return max(1.0, 1.4826 * float(np.median(np.abs(self.residual))))
 
 
 class Problem:
@@ -102,34 +132,83 @@ class Problem:
         self.each = 7 if delays else 6
         self.poses = self.each * (lidars - 1)
         self.unknowns = self.poses + 6 * len(places)
+        self._stems: dict[tuple[int, int], Stems] = {}
 
-    def clouds(self, place: int, state: State, edge_m: float) -> list[Planes]:
+    def clouds(
+        self, place: int, state: State, edge_m: float, points: int = 1 << 40
+    ) -> list[Planes]:
         """Planes of the clouds of a place, moved to its instant."""
         found: list[Planes] = []
         for cloud in self.places[place]:
-            pose = state.corrections[cloud.lidar]
-            points_m = np.matmul(cloud.points_m, pose.rotation.T) + pose.position_m
-            time_s = cloud.time_s + state.delay_s[cloud.lidar]
+            # An odd step takes all beams in turn.
+            step = len(cloud.points_m) // points * 2 + 1 if len(cloud.points_m) > points else 1
+            time_s = cloud.time_s[::step] + state.delay_s[cloud.lidar]
+            points_m = _corrected(cloud.points_m[::step], state.corrections[cloud.lidar])
             found.append(planes(moved(points_m, time_s, state.twists[place]), time_s, edge_m))
         return found
 
-    def rows(self, state: State, level: Level) -> Rows:
-        """All equations at a state."""
-        rows = Rows()
-        for number, place in enumerate(self.places):
-            surfaces = self.clouds(number, state, level.edge_m)
-            for first, second in combinations(range(len(place)), 2):
-                pair = place[first].lidar, place[second].lidar
-                found = distances(surfaces[first], surfaces[second], level.parallel, level.most_m)
-                if len(found):
-                    self._add(rows, number, pair, found, state.twists[number])
-        return rows
+    def stems(self, place: int, state: State) -> list[Stems | None]:
+        """Stems of the clouds of a place, moved to its instant."""
+        found: list[Stems | None] = []
+        for number, cloud in enumerate(self.places[place]):
+            if cloud.origin_m is None:
+                found.append(None)
+                continue
+            if (place, number) not in self._stems:
+                self._stems[place, number] = stems(cloud.points_m, cloud.time_s, cloud.origin_m)
+            seen, pose = self._stems[place, number], state.corrections[cloud.lidar]
+            time_s = seen.time_s + state.delay_s[cloud.lidar]
+            axis_m = moved(_corrected(seen.axis_m, pose), time_s, state.twists[place])
+            along = np.matmul(pose.rotation, seen.along)
+            found.append(Stems(axis_m, along, seen.radius_m, seen.sigma_m, time_s))
+        return found
 
-    def _add(
-        self, rows: Rows, place: int, pair: tuple[int, int], found: Distances, twist: F64Array
-    ) -> None:
-        jacobian = np.zeros((len(found), self.unknowns))
-        lever = np.concatenate([found.normal, np.cross(found.at_m, found.normal)], axis=1)
+    def rows(self, state: State, level: Level) -> list[Rows]:
+        """All equations at a state, by place."""
+        return [self._place_rows(number, state, level) for number in range(len(self.places))]
+
+    def _place_rows(self, number: int, state: State, level: Level) -> Rows:
+        place = self.places[number]
+        surfaces = self.clouds(number, state, level.edge_m, level.points)
+        uprights = self.stems(number, state)
+        parts = []
+        for first, second in combinations(range(len(place)), 2):
+            pair = place[first].lidar, place[second].lidar
+            found = distances(surfaces[first], surfaces[second], level.parallel, level.most_m)
+            parts.append(self._rows(pair, found, state.twists[number]))
+            one, other = uprights[first], uprights[second]
+            if one is not None and other is not None:
+                axes = stem_distances(one, other, level.parallel, level.most_m)
+                if axes is not None:
+                    parts.append(self._rows(pair, axes, state.twists[number]))
+        if not parts:
+            empty = np.zeros((0, self.poses + 6))
+            none = np.zeros(0, np.int64)
+            return Rows(empty, empty, np.zeros(0), none, none.reshape(0, 2))
+        return Rows(
+            np.concatenate([part.jacobian for part in parts]),
+            np.concatenate([part.noise for part in parts]),
+            np.concatenate([part.residual for part in parts]),
+            np.concatenate([part.block for part in parts]),
+            np.concatenate([part.pair for part in parts]),
+        )
+
+    def _rows(self, pair: tuple[int, int], found: Distances, twist: F64Array) -> Rows:
+        weight = 1.0 / found.sigma_m[:, None]
+        cell = np.floor(found.at_m / _BLOCK_M).astype(np.int64) + 5000
+        return Rows(
+            self._jacobian(pair, found, found.normal, twist) * weight,
+            self._jacobian(pair, found, found.tilt, twist) * weight,
+            found.distance_m / found.sigma_m,
+            (cell[:, 0] * 10000 + cell[:, 1]) * 10000 + cell[:, 2],
+            np.tile(np.array(pair), (len(found), 1)),
+        )
+
+    def _jacobian(
+        self, pair: tuple[int, int], found: Distances, normal: F64Array, twist: F64Array
+    ) -> F64Array:
+        jacobian = np.zeros((len(found), self.poses + 6))
+        lever = np.concatenate([normal, np.cross(found.at_m, normal)], axis=1)
         for lidar, sign in zip(pair, (-1.0, 1.0), strict=True):
             if lidar:
                 at = self.each * (lidar - 1)
@@ -137,25 +216,28 @@ class Problem:
                 if self.each == 7:
                     jacobian[:, at + 6] += sign * np.matmul(lever, twist)
         apart_s = found.time_s[:, 1] - found.time_s[:, 0]
-        at = self.poses + 6 * place
-        jacobian[:, at : at + 6] = lever * apart_s[:, None]
-        block = np.floor(found.at_m / _BLOCK_M).astype(np.int64)
-        key = ((place * 1000 + block[:, 0]) * 1000 + block[:, 1]) * 1000 + block[:, 2]
-        rows.jacobian.append(jacobian / found.sigma_m[:, None])
-        rows.residual.append(found.distance_m / found.sigma_m)
-        rows.block.append(key)
-        rows.pair.append(np.tile(np.array(pair), (len(found), 1)))
+        jacobian[:, self.poses :] = lever * apart_s[:, None]
+        return jacobian
+
+
+def _corrected(points_m: F64Array, pose: Pose) -> F64Array:
+    if pose is ORIGIN:
+        return points_m
+    found: F64Array = np.matmul(points_m, pose.rotation.T) + pose.position_m
+    return found
 
 
 def moved(points_m: F64Array, time_s: F64Array, twist: F64Array) -> F64Array:
     """Points (n, 3) moved by a constant twist (6,) over their times (n,)."""
-    if not twist.any():
+    if not twist.any() or not len(points_m):
         return points_m
-    # A thousand steps over the time of a place are enough for any vehicle.
-    steps, index = np.unique(np.round(time_s, 4), return_inverse=True)
+    # Steps of 0.1 ms are enough for any vehicle.
+    index = np.round(time_s * 1e4).astype(np.int64)
+    least = int(index.min())
+    index -= least
+    steps = (np.arange(int(index.max()) + 1) + least) * 1e-4
     rotation, shift = exp_transform(steps[:, None] * twist[:3], steps[:, None] * twist[3:])
-    turned = np.matmul(rotation[index], points_m[:, :, None])[:, :, 0]
-    found: F64Array = turned + shift[index]
+    found: F64Array = at_rows(rotation[index], points_m) + shift[index]
     return found
 
 
@@ -164,8 +246,9 @@ class Solution:
     """Outcome.
 
     covariance: (poses, poses) of the corrections, twists eliminated, m and rad; weak: (poses, w),
-    unit directions (a turn counts 10 m a rad) that the scene does not determine; matched: of each
-    pair of lidars, distances that were used; rms: of residuals in standard deviations.
+    unit directions (a turn counts 10 m a rad) that the scene does not determine, in which the
+    covariance is that of 1 m; matched: of each pair of lidars, distances that were used; rms: of
+    residuals in standard deviations.
     """
 
     state: State
@@ -176,20 +259,14 @@ class Solution:
     converged: bool
 
 
-# A turn by 1 rad moves what is this far by as much, m.
-_LEVER_M = 10.0
-# Standard deviations of a direction that is determined, m and (by _LEVER_M) rad.
-_MOST_SIGMA_M = 0.015
-
-
 def solve(problem: Problem, state: State, level: Level, most_steps: int = 25) -> Solution:
-    """Gauss-Newton from a state, with surfaces matched anew in each step."""
+    """Damped Gauss-Newton from a state, with surfaces matched anew in each step."""
     converged = False
-    equations = _Equations(problem, problem.rows(state, level))
+    equations = _Equations(problem, problem.rows(state, level), state)
     for _ in range(most_steps):
         step = equations.step()
         state = _after(problem, state, step)
-        equations = _Equations(problem, problem.rows(state, level))
+        equations = _Equations(problem, problem.rows(state, level), state)
         if _is_small(problem, step):
             converged = True
             break
@@ -214,96 +291,152 @@ def find_poses(
 
 def _is_small(problem: Problem, step: F64Array) -> bool:
     six = step[: problem.poses].reshape(-1, problem.each) if problem.poses else np.zeros((0, 6))
-    return bool((np.abs(six[:, :3]) < _STEP_M).all() and (np.abs(six[:, 3:6]) < _STEP_RAD).all())
+    return bool((np.abs(six[:, :3]) < _SMALL_M).all() and (np.abs(six[:, 3:6]) < _SMALL_RAD).all())
+
+
+def _shortened(step: F64Array, shift: float, turn: float) -> F64Array:
+    """Steps (k, 6 or 7), each within the longest shift and turn."""
+    ratio = np.maximum(
+        np.linalg.norm(step[:, :3], axis=1) / shift, np.linalg.norm(step[:, 3:6], axis=1) / turn
+    )
+    found: F64Array = step / np.maximum(ratio, 1.0)[:, None]
+    return found
 
 
 def _after(problem: Problem, state: State, step: F64Array) -> State:
     """The state after a step (u,)."""
     corrections = list(state.corrections)
     delay_s = state.delay_s.copy()
-    for lidar in range(1, problem.lidars):
-        at = problem.each * (lidar - 1)
-        pose, part = corrections[lidar], step[at : at + problem.each]
+    parts = _shortened(step[: problem.poses].reshape(-1, problem.each), _LONGEST_M, _LONGEST_RAD)
+    for lidar, part in enumerate(parts, 1):
+        pose = corrections[lidar]
         turn = exp_rotation(part[None, 3:6])[0]
         corrections[lidar] = Pose(
             np.matmul(turn, pose.rotation), np.matmul(turn, pose.position_m) + part[:3]
         )
         if problem.each == 7:
             delay_s[lidar] += part[6]
-    return State(corrections, state.twists + step[problem.poses :].reshape(-1, 6), delay_s)
+    twists = _shortened(step[problem.poses :].reshape(-1, 6), _LONGEST_MPS, _LONGEST_RADPS)
+    return State(corrections, state.twists + twists, delay_s)
 
 
 class _Equations:
-    """Normal equations of rows, with robust weights."""
+    """Normal equations of rows, with robust weights; the twist of each place is eliminated."""
 
-    def __init__(self, problem: Problem, rows: Rows) -> None:
+    def __init__(self, problem: Problem, rows: Sequence[Rows], state: State) -> None:
         self.problem = problem
-        empty = not rows.jacobian
-        self.jacobian = np.zeros((0, problem.unknowns)) if empty else np.concatenate(rows.jacobian)
-        self.residual = np.zeros(0) if empty else np.concatenate(rows.residual)
-        self.block = np.zeros(0, np.int64) if empty else np.concatenate(rows.block)
-        self.pair = np.zeros((0, 2), np.int64) if empty else np.concatenate(rows.pair)
-        # Noise of real scenes exceeds that of the points; never below 1.
-        scale = 1.4826 * float(np.median(np.abs(self.residual))) if len(self.residual) else 1.0
-        self.scale = max(1.0, scale)
-        normalised = self.residual / self.scale
-        self.weight = 1.0 / (1.0 + (normalised / _KERNEL) ** 2)
-        self.rms = float(np.sqrt((normalised**2 * self.weight).mean())) if len(normalised) else 0.0
-        self._scaled = self.jacobian / self.scale
-        # What is not seen at all stays where it is.
-        self._prior = np.full(problem.unknowns, 1e-6)
-        self.normal = np.matmul(self._scaled.T * self.weight, self._scaled)
-        self.inverse = np.linalg.inv(self.normal + np.diag(self._prior))
+        self._rows = rows
+        self._twists = state.twists
+        self._prior = np.array([_SPEED_MPS**-2.0] * 3 + [_TURN_RADPS**-2.0] * 3)
+        self._units = np.ones(problem.poses)
+        for lidar in range(problem.lidars - 1):
+            at = problem.each * lidar
+            self._units[at + 3 : at + 6] = 1.0 / _LEVER_M
+        self._residual = [part.residual / part.scale for part in rows]
+        # Share of each residual in the kernel.
+        self._off = [(residual / _KERNEL) ** 2 for residual in self._residual]
+        squares = sum(
+            float((residual**2 / (1.0 + off)).sum())
+            for residual, off in zip(self._residual, self._off, strict=True)
+        )
+        self.rms = float(np.sqrt(squares / max(1, sum(map(len, self._residual)))))
 
     def step(self) -> F64Array:
         """Change of all unknowns."""
-        gradient = np.matmul(self._scaled.T, self.weight * self.residual / self.scale)
-        found: F64Array = -np.matmul(self.inverse, gradient)
-        return found
+        size = self.problem.poses
+        damped = _STEP_M**-2.0 / self._units**2
+        normal, gradient = np.diag(damped), np.zeros(size)
+        lever = np.array([1.0] * 3 + [_LEVER_M] * 3)
+        kept = []
+        for part, residual, off, twist in zip(
+            self._rows, self._residual, self._off, self._twists, strict=True
+        ):
+            jacobian = part.jacobian / part.scale
+            weighted = jacobian / (1.0 + off)[:, None]
+            square, slope = np.matmul(weighted.T, jacobian), np.matmul(weighted.T, residual)
+            slope[size:] += self._prior * twist
+            square[size:, size:] += np.diag(self._prior + (lever / _STEP_MPS) ** 2)
+            ratio = np.linalg.solve(square[size:, size:], square[size:, :size]).T
+            normal += square[:size, :size] - np.matmul(ratio, square[size:, :size])
+            gradient += slope[:size] - np.matmul(ratio, slope[size:])
+            kept.append((square, slope))
+        poses = -np.linalg.solve(normal, gradient) if size else gradient
+        twists = [
+            -np.linalg.solve(square[size:, size:], slope[size:] + square[size:, :size] @ poses)
+            for square, slope in kept
+        ]
+        return np.concatenate([poses, *twists])
 
     def matched(self) -> dict[tuple[int, int], int]:
         """Number of distances by pair of lidars."""
-        pairs, counts = np.unique(self.pair, axis=0, return_counts=True)
+        if not self._rows:
+            return {}
+        pair = np.concatenate([part.pair for part in self._rows])
+        pairs, counts = np.unique(pair, axis=0, return_counts=True)
         return {(int(a), int(b)): int(n) for (a, b), n in zip(pairs, counts, strict=True)}
 
     def determined(self) -> tuple[F64Array, F64Array]:
-        """Covariance of the poses, and the directions that are not determined."""
-        size = self.problem.poses
-        units = np.ones(size)
-        for lidar in range(self.problem.lidars - 1):
-            at = self.problem.each * lidar
-            units[at + 3 : at + 6] = 1.0 / _LEVER_M
-        plain = self.inverse[:size, :size]
-        _, axes = np.linalg.eigh(plain / units[:, None] / units)
-        weak = [axis for axis in axes.T if not self._is_seen(axis, units)]
-        # Sums of a block count as one observation (sandwich); never less than noise alone gives.
-        by_block = self._by_block()[:size, :size]
-        least, found = np.diag(plain), np.maximum(np.diag(by_block), 1e-30)
-        grown = np.sqrt(np.maximum(1.0, least / found))
-        return by_block * grown[:, None] * grown, np.array(weak).reshape(-1, size).T
+        """Covariance of the poses, and the directions that are not determined.
 
-    def _by_block(self) -> F64Array:
-        """Covariance of all unknowns if observations of a block are one."""
-        order = np.argsort(self.block, kind="stable")
-        scores = self._scaled * (self.weight * self.residual / self.scale)[:, None]
-        first = np.unique(self.block[order], return_index=True)[1]
-        summed = np.add.reduceat(scores[order], first, axis=0) if len(order) else scores
-        meat = np.matmul(summed.T, summed)
-        found: F64Array = np.matmul(np.matmul(self.inverse, meat), self.inverse)
-        return found
-
-    def _is_seen(self, axis: F64Array, units: F64Array) -> bool:
-        """Whether observations along a direction of the poses (size,) determine it."""
+        Normals are not exact, which adds information in directions that nothing shows. The errors
+        of the two normals of a distance are independent: the product of both is free of them.
+        """
         size = self.problem.poses
-        # What a change along the axis does to the distances that the twists do not take up.
-        change = np.matmul(self._scaled[:, :size], axis * units)
-        twists = self._scaled[:, size:]
-        if twists.shape[1]:
-            root = np.sqrt(self.weight)
-            fit, *_ = np.linalg.lstsq(twists * root[:, None], change * root, rcond=1e-9)
-            change = change - np.matmul(twists, fit)
-        sigma = 1.0 / np.maximum(np.abs(self._scaled).max(axis=1), 1e-12)
-        along = np.abs(change) * sigma >= _ALONG
-        known = float((self.weight[along] * change[along] ** 2).sum())
-        blocks = len(np.unique(self.block[along]))
-        return blocks >= _FEWEST_BLOCKS and known * _MOST_SIGMA_M**2 > 1.0
+        if not size:
+            return np.zeros((0, 0)), np.zeros((0, 0))
+        plain, true = np.zeros((2, size, size))
+        scores, levers, noises, blocks = [], [], [], []
+        for part, residual, off in zip(self._rows, self._residual, self._off, strict=True):
+            jacobian, noise = part.jacobian / part.scale, part.noise / part.scale
+            # Derivative of the kernel, which is below its weight.
+            slope = (1.0 - off) / (1.0 + off) ** 2
+            within, bare = _product(jacobian, slope), _product(noise, slope)
+            twist = _floored(within[size:, size:] - bare[size:, size:], self._prior)
+            ratio = np.linalg.solve(twist, within[size:, :size] - bare[size:, :size])
+            pose = jacobian[:, :size] - np.matmul(jacobian[:, size:], ratio)
+            wrong = noise[:, :size] - np.matmul(noise[:, size:], ratio)
+            pose, wrong = pose * self._units, wrong * self._units
+            plain += _product(pose, slope)
+            true += _product(pose, slope) - _product(wrong, slope)
+            scores.append(pose * (residual / (1.0 + off))[:, None])
+            levers.append(pose * np.sqrt(np.abs(slope))[:, None])
+            noises.append(wrong * np.sqrt(np.abs(slope))[:, None])
+            blocks.append(part.block)
+        block = np.concatenate(blocks)
+        score, lever, noise = map(np.concatenate, (scores, levers, noises))
+        known, axes = np.linalg.eigh(true)
+        share = known / np.maximum(np.einsum("ik,ij,jk->k", axes, plain, axes), 1e-12)
+        seen = (known > _MOST_SIGMA_M**-2.0) & (share > _TRUE_SHARE)
+        # Sums of a block count as one observation (sandwich).
+        _, number = np.unique(block, return_inverse=True)
+        count = int(number.max()) + 1 if len(number) else 0
+        inverse = np.where(seen, 1.0 / np.where(seen, known, 1.0), 0.0)
+        summed = np.zeros((count, size))
+        np.add.at(summed, number, np.matmul(score, axes))
+        summed *= inverse
+        covariance = np.matmul(summed.T, summed) * (count / max(1.0, count - size))
+        by_block = np.zeros((count, size))
+        np.add.at(by_block, number, np.matmul(lever, axes) ** 2 - np.matmul(noise, axes) ** 2)
+        effective = by_block.sum(axis=0) ** 2 / np.maximum((by_block**2).sum(axis=0), 1e-12)
+        seen &= (effective >= _FEWEST_BLOCKS) & (np.diag(covariance) < _MOST_SIGMA_M**2)
+        covariance[~seen] = 0.0
+        covariance[:, ~seen] = 0.0
+        covariance += np.diag(np.where(seen, 0.0, _UNKNOWN_M**2))
+        to_units = axes * self._units[:, None]
+        floor = np.where(self._units == 1.0, _FLOOR_M, _FLOOR_RAD)
+        found = np.matmul(np.matmul(to_units, covariance), to_units.T) + np.diag(floor**2)
+        return found, axes[:, ~seen]
+
+
+def _product(rows: F64Array, weight: F64Array) -> F64Array:
+    found: F64Array = np.matmul((rows * weight[:, None]).T, rows)
+    return found
+
+
+def _floored(information: F64Array, prior: F64Array) -> F64Array:
+    """Information (6, 6) of a twist with its prior (6,), in no direction less than that."""
+    root = np.sqrt(prior)
+    value, axes = np.linalg.eigh(information / root[:, None] / root)
+    scaled = np.matmul(axes * (np.maximum(value, 0.0) + 1.0), axes.T)
+    found: F64Array = scaled * root[:, None] * root
+    return found

@@ -105,7 +105,7 @@ class Distances:
 
     key: (m,), of the cell; normal: (m, 3); at_m: (m, 3), between the two planes; distance_m: (m,),
     from the first to the second along the normal; sigma_m: (m,), its standard deviation;
-    time_s: (m, 2), of both.
+    time_s: (m, 2), of both; tilt: (m, 3), half of the difference of the two normals.
     """
 
     key: I64Array
@@ -114,15 +114,25 @@ class Distances:
     distance_m: F64Array
     sigma_m: F64Array
     time_s: F64Array
+    tilt: F64Array
 
     def __len__(self) -> int:
         return len(self.key)
 
 
+def at_rows(rotations: F64Array, vectors: F64Array) -> F64Array:
+    """Rotations (n, 3, 3) of vectors (n, 3), each of its own."""
+    turned: F64Array = np.einsum("nij,nj->ni", rotations, vectors)
+    return turned
+
+
 def shared_cells(first: Planes, second: Planes) -> tuple[I64Array, I64Array]:
     """Rows of both in which they have a plane in the same cell."""
-    _, left, right = np.intersect1d(first.key, second.key, assume_unique=True, return_indices=True)
-    return left, right
+    at = np.minimum(np.searchsorted(second.key, first.key), max(0, len(second.key) - 1))
+    if not len(second.key):
+        return at[:0], at[:0]
+    left = np.flatnonzero(second.key[at] == first.key)
+    return left, at[left]
 
 
 def distances(first: Planes, second: Planes, parallel: float, most_m: float) -> Distances:
@@ -133,7 +143,8 @@ def distances(first: Planes, second: Planes, parallel: float, most_m: float) -> 
     left, right = shared_cells(first, second)
     first, second = first.take(left), second.take(right)
     cosine = (first.normal * second.normal).sum(axis=1)
-    normal = first.normal + np.sign(cosine)[:, None] * second.normal
+    opposite = np.sign(cosine)[:, None] * second.normal
+    normal = first.normal + opposite
     normal /= np.linalg.norm(normal, axis=1, keepdims=True) + 1e-12
     at_m = (first.mean_m + second.mean_m) / 2
     distance_m = (normal * (second.mean_m - first.mean_m)).sum(axis=1)
@@ -146,4 +157,5 @@ def distances(first: Planes, second: Planes, parallel: float, most_m: float) -> 
         distance_m[kept],
         np.sqrt(variance[kept]),
         np.stack([first.time_s, second.time_s], axis=1)[kept],
+        ((first.normal - opposite) / 2)[kept],
     )

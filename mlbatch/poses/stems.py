@@ -1,0 +1,202 @@
+"""Axes of upright stems, poles and columns in a cloud.
+
+Two lidars see different sides of a stem. Across its width the points of a beam that sweeps over a
+cylinder are spread evenly, so their variance there is r^2 / 3, and their mean lies pi / 4 r before
+the axis: radius and axis follow in closed form.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from mlbatch.arrays import BoolArray, F64Array, I64Array
+from mlbatch.poses.surfaces import Distances
+
+# Points are grouped in layers, by neighbouring cells in a layer, m.
+_LAYER_M = 0.8
+_CELL_M = 0.2
+_FARTHEST_M = 25.0
+# Groups wider than this many cells are no stems.
+_MOST_CELLS = 6
+_LEAST_POINTS = 10
+_RADIUS_M = (0.05, 0.5)
+# Of the heights of the points of a stem, m: less than two rings have.
+_LEAST_HIGH_M = 0.08
+# Kurtosis across: 1.8 where points are spread evenly, 1 of two columns, 3 of foliage.
+_KURTOSIS = (1.45, 2.4)
+# Curvature of the face seen, as a share of 1 / radius: least squares of the half circle give 0.74.
+_CURVED = (0.3, 1.3)
+# Of the depth of points about the half circle, m and share of the radius.
+_ROUGH_M, _ROUGH_SHARE = 0.03, 0.2
+# Of an axis that is not a perfect cylinder, m.
+_FLOOR_M = 0.008
+# Stems stand parallel: fewest steps from layer to layer that say how, and most of a step, m.
+_FEWEST_STEPS = 4
+_MOST_STEP_M = 0.5
+# Stems are compared at most this far from their middles, m.
+_MOST_ALONG_M = 0.6
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Stems:
+    """Pieces of k stems of a cloud.
+
+    axis_m: (k, 3), on the axis in the middle of the piece; along: (3,), unit, of all; radius_m,
+    sigma_m, time_s: (k,); sigma of the axis across.
+    """
+
+    axis_m: F64Array
+    along: F64Array
+    radius_m: F64Array
+    sigma_m: F64Array
+    time_s: F64Array
+
+    def __len__(self) -> int:
+        return len(self.radius_m)
+
+
+NO_STEMS = Stems(np.zeros((0, 3)), np.array([0.0, 0.0, 1.0]), np.zeros(0), np.zeros(0), np.zeros(0))
+
+
+def stems(points_m: F64Array, time_s: F64Array, origin_m: F64Array) -> Stems:
+    """Stems among points (n, 3) with times (n,), seen from the origin (3,) of their lidar.
+
+    z must be up within 30 degrees.
+    """
+    near = ((points_m - origin_m) ** 2).sum(axis=1) < _FARTHEST_M**2
+    group = _groups(points_m[near])
+    rows = np.flatnonzero(near)[group >= 0]
+    group = group[group >= 0]
+    if not len(group):
+        return NO_STEMS
+    order = np.argsort(group, kind="stable")
+    rows, group = rows[order], group[order]
+    first = np.flatnonzero(np.concatenate([[True], group[1:] != group[:-1]]))
+    points_m = points_m[rows]
+    count = np.diff(first, append=len(rows))
+    mean = np.add.reduceat(points_m, first, axis=0) / count[:, None]
+    along = _direction(mean)
+    if along is None:
+        return NO_STEMS
+    view = mean - origin_m
+    view -= np.matmul(view, along)[:, None] * along
+    view /= np.linalg.norm(view, axis=1, keepdims=True)
+    local = points_m - np.repeat(mean, count, axis=0)
+    high = np.matmul(local, along)
+    across = (local * np.repeat(np.cross(along, view), count, axis=0)).sum(axis=1)
+    deep = (local * np.repeat(view, count, axis=0)).sum(axis=1)
+    width = across**2
+    terms = np.stack([high**2, width, width**2, deep, deep * width, deep**2], axis=1)
+    high2, width2, width4, deep1, deep_width, deep2 = (
+        np.add.reduceat(terms, first, axis=0) / count[:, None]
+    ).T
+    radius_m = np.sqrt(3.0 * width2 * count / (count - 1))
+    kurtosis = width4 / (width2**2 + 1e-12)
+    spread = width4 - width2**2
+    curve = (deep_width - deep1 * width2) / (spread + 1e-12)
+    rough_m = np.sqrt(np.maximum(deep2 - curve**2 * spread, 0.0))
+    good = (high2 > _LEAST_HIGH_M**2) & _within(radius_m, _RADIUS_M) & _within(kurtosis, _KURTOSIS)
+    good &= _within(curve * radius_m, _CURVED)
+    good &= rough_m < _ROUGH_M + _ROUGH_SHARE * radius_m
+    axis_m = mean + np.pi / 4 * radius_m[:, None] * view
+    # Points stand in columns, about 5 across, so that their mean is better than at random.
+    sigma_m = np.sqrt(_FLOOR_M**2 + radius_m**2 / 3 / (5 * count))
+    mean_s = np.add.reduceat(time_s[rows], first) / count
+    return Stems(axis_m[good], along, radius_m[good], sigma_m[good], mean_s[good])
+
+
+def _within(values: F64Array, limits: tuple[float, float]) -> BoolArray:
+    return (values >= limits[0]) & (values <= limits[1])
+
+
+def _groups(points_m: F64Array) -> I64Array:
+    """A number of the group of each point (n,): neighbours in a layer; -1: too large or small."""
+    cells = np.floor(points_m / [_CELL_M, _CELL_M, _LAYER_M]).astype(np.int64) + (1 << 16)
+    key, inverse, count = np.unique(
+        (cells[:, 2] << 40) | (cells[:, 1] << 20) | cells[:, 0],
+        return_inverse=True,
+        return_counts=True,
+    )
+    ends = []
+    for step in (1, 1 << 20, (1 << 20) + 1, (1 << 20) - 1):
+        at = np.minimum(np.searchsorted(key, key + step), max(0, len(key) - 1))
+        start = np.flatnonzero(key[at] == key + step)
+        ends.append((start, at[start]))
+    one, other = (np.concatenate(side) for side in zip(*ends, strict=True))
+    label = np.arange(len(key))
+    # The least number of a group reaches all of its cells if it is small.
+    for _ in range(_MOST_CELLS):
+        least = np.minimum(label[one], label[other])
+        np.minimum.at(label, one, least)
+        np.minimum.at(label, other, least)
+    size = np.zeros(len(key), np.int64)
+    np.add.at(size, label, count)
+    usable = size >= _LEAST_POINTS
+    usable[label[one][label[one] != label[other]]] = False
+    usable[label[other][label[one] != label[other]]] = False
+    label[~usable[label]] = -1
+    found: I64Array = label[inverse]
+    return found
+
+
+def _direction(mean: F64Array) -> F64Array | None:
+    """The direction of the most stems, from groups (k, 3) above each other."""
+    layer = np.floor(mean[:, 2] / _LAYER_M).astype(np.int64)
+    apart = mean[None, :, :] - mean[:, None, :]
+    level = np.hypot(apart[:, :, 0], apart[:, :, 1])
+    level[layer[None, :] != layer[:, None] + 1] = np.inf
+    nearest = np.argmin(level, axis=1)
+    steps = np.flatnonzero(level[np.arange(len(mean)), nearest] < _MOST_STEP_M)
+    if len(steps) < _FEWEST_STEPS:
+        return None
+    way = apart[steps, nearest[steps]]
+    slope = np.median(way[:, :2] / way[:, 2:], axis=0)
+    way = np.array([slope[0], slope[1], 1.0])
+    found: F64Array = way / np.linalg.norm(way)
+    return found
+
+
+def stem_distances(first: Stems, second: Stems, parallel: float, most_m: float) -> Distances | None:
+    """Compare the axes of two clouds, each with the nearest of the other: two rows a pair.
+
+    parallel: least cosine between the directions; most_m: largest distance.
+    """
+    if not len(first) or not len(second) or first.along @ second.along < parallel:
+        return None
+    along = first.along + second.along
+    along /= np.linalg.norm(along)
+    apart = second.axis_m[None, :, :] - first.axis_m[:, None, :]
+    high = apart @ along
+    apart = apart - high[:, :, None] * along
+    far = np.linalg.norm(apart, axis=2)
+    far[np.abs(high) > _MOST_ALONG_M] = np.inf
+    right = np.argmin(far, axis=1)
+    left = np.arange(len(first))
+    kept = (np.argmin(far, axis=0)[right] == left) & (far[left, right] < most_m)
+    left, right = left[kept], right[kept]
+    # A radius that differs says that they are two stems.
+    ratio = first.radius_m[left] / second.radius_m[right]
+    kept = (ratio > 0.5) & (ratio < 2.0)
+    left, right = left[kept], right[kept]
+    if not len(left):
+        return None
+    ways = np.linalg.svd(along[None])[2][1:]
+    middle_m = (first.axis_m[left] + second.axis_m[right]) / 2
+    # Each along its own direction to the height of the middle.
+    half = high[left, right, None] / 2
+    gap = second.axis_m[right] - first.axis_m[left] - half * (first.along + second.along)
+    sigma_m = np.sqrt(first.sigma_m[left] ** 2 + second.sigma_m[right] ** 2)
+    time_s = np.stack([first.time_s[left], second.time_s[right]], axis=1)
+    tilt = (first.along - second.along) / 2
+    number = len(left)
+    return Distances(
+        np.concatenate([left, left]),
+        np.repeat(ways, number, axis=0),
+        np.concatenate([middle_m, middle_m]),
+        np.concatenate([gap @ ways[0], gap @ ways[1]]),
+        np.concatenate([sigma_m, sigma_m]),
+        np.concatenate([time_s, time_s]),
+        np.repeat([-(tilt @ way) * along for way in ways], number, axis=0),
+    )
