@@ -320,6 +320,14 @@ CONVERT: Final = (
         metavar="FILE",
         in_rig=False,
     ),
+    Option(
+        "html_scans",
+        TEXT,
+        "Output",
+        "Scans on the page, with all their points.  [default: as many as 3 MB hold]",
+        metavar="N|all",
+        in_rig=False,
+    ),
     Option("overwrite", FLAG, "Output", "Replace an existing output.", default=False, in_rig=False),
     Option(
         "no_fsync", FLAG, "Output", "Do not wait until the output is on the disk.", default=False

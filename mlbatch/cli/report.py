@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
@@ -29,13 +30,20 @@ def report(
         Path | None,
         typer.Option(help="Report of the run (JSON). [default: in OUTPUT or next to it]"),
     ] = None,
+    html_scans: Annotated[
+        str | None,
+        typer.Option(
+            help="Scans on the page, with all their points. [default: as many as 3 MB hold]",
+            metavar="N|all",
+        ),
+    ] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an existing page.")] = (
         False
     ),
 ) -> None:
     """Write a page (HTML) of a run: verdict, timeline, fill, clocks, accounts, scans."""
     from mlbatch.bounded import MOST_BYTES
-    from mlbatch.cli.parameters import is_stdout
+    from mlbatch.cli.parameters import is_stdout, shown_scans
     from mlbatch.errors import UsageError, one_line
     from mlbatch.page import check_page, find_source, source_of_text, write_page
     from mlbatch.page.document import page_text
@@ -55,6 +63,7 @@ def report(
         found = source_of_text(Path("standard input"), text)
     else:
         found = find_source(source, report)
+    found = replace(found, scans=shown_scans(html_scans))
     page = output or found.page
     if is_stdout(output):
         typer.echo(page_text(found), nl=False)

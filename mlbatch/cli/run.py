@@ -43,6 +43,7 @@ class Target(NamedTuple):
     request: OutputRequest
     prints_report: bool  # to standard output, without a summary
     html: Path | None  # page of the run
+    html_scans: int | None  # see `Source`
     split_jumps: bool
     limits: tuple[Limit, ...]  # of `--fail-on`
     quiet: bool
@@ -210,7 +211,7 @@ def _write_page(conversion: Conversion, inputs: RunReport, target: Target) -> No
 
     report = report_of(target.html, report_text(inputs))
     table = None if conversion.table is None else conversion.table.text()
-    write_page(target.html, Source(report, table, target.written, target.html))
+    write_page(target.html, Source(report, table, target.written, target.html, target.html_scans))
 
 
 def _print_sensors(conversion: Conversion) -> None:

@@ -10,7 +10,7 @@ from fractions import Fraction
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
-from mlbatch.cli.parameters import is_stdout
+from mlbatch.cli.parameters import is_stdout, shown_scans
 from mlbatch.cli.run import Target
 from mlbatch.errors import UsageError
 from mlbatch.options import INSTANTS
@@ -71,6 +71,7 @@ def target_of(values: Mapping[str, Any]) -> Target:
         request,
         prints_report=is_stdout(report),
         html=values["html"],
+        html_scans=shown_scans(values["html_scans"]),
         split_jumps=on_jump == "split",
         limits=_fail_on(values["fail_on"] or ()),
         quiet=values["quiet"],

@@ -1,14 +1,13 @@
-"""Chosen scans of an output, read by their place in it, and thinned for the page."""
+"""Chosen scans of an output, read by their place in it."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
-from mlbatch.arrays import BoolArray, F32Array, F64Array, U8Array, U16Array
 from mlbatch.outputs.cloud_messages import CLOUD, read_cloud, stored_scan
 from mlbatch.outputs.containers import BoundedFile, Message, library_errors
 from mlbatch.outputs.damage import CheckLog, DamageError, VerifyError
@@ -17,87 +16,100 @@ from mlbatch.outputs.folders import scan_files
 from mlbatch.outputs.kinds import FileFormat, kind_of
 from mlbatch.outputs.run_files import mcaps_of
 from mlbatch.outputs.stored_scan import StoredScan
+from mlbatch.page.points import PageCloud, Place, page_cloud
 from mlbatch.page.windows import Windows
-from mlbatch.units import NS_PER_S
 
-# Points of all scans on a page: 9 bytes each, 12 in base64.
-MOST_POINTS = 54_000
+# Characters of the scans of a page, and points, of 4 characters or less each.
+_MOST_CHARS = 3_000_000
+_MOST_POINTS = 750_000
+# Of scans that were asked for: what browsers open.
+_MOST_POINTS_ASKED = 40_000_000
+# First, middle and worst.
+_LEAST_SCANS = 3
+# Scans in memory.
+_AT_ONCE = 8
 # Opcode and length.
 _RECORD_HEAD_BYTES = 9
-_BYTE = 255
-_WORD = 65535
-# Shares of the points that the range of a colour covers: single bright points are no scale.
-_LOW, _HIGH = 0.02, 0.98
-# Share of the points of a lidar inside the first view.
-_IN_VIEW = 0.97
-_SEED = 0
 
 
-@dataclass(frozen=True, slots=True)
-class Place:
-    """A window to show."""
+def chosen_clouds(output: Path, windows: Windows, scans: int | None) -> list[PageCloud]:
+    """The scans of an output to show, in order; every nth column of all where a limit demands it.
 
-    title: str
-    row: int  # of the table
-    index: int
-    slice: int
-    start_ns: int
-
-
-@dataclass(frozen=True, slots=True)
-class PageCloud:
-    """A scan as the page stores it."""
-
-    place: Place
-    total: int  # points of the scan
-    low_m: tuple[float, float, float]
-    size_m: float  # of the cube that the coordinates divide
-    xyz: U16Array  # (p, 3)
-    lidar: U8Array
-    time: U8Array  # of the window
-    intensity: U8Array
-    height_m: tuple[float, float]  # range of the colours
-    centre_m: tuple[float, float, float]  # of the first view
-    view_m: float  # radius around the centre that contains most points of every lidar
-    has_lidar: bool
-    has_time: bool
-    has_intensity: bool
+    scans: number, 0 for all; None: as many as the page has room for, three at least. Raises
+    VerifyError if the output cannot be read.
+    """
+    places = choose_places(windows, _LEAST_SCANS if scans is None else scans)
+    if scans is None:
+        places = [place for place in places if place.title]
+    most = _MOST_POINTS if scans is None else _MOST_POINTS_ASKED
+    stride = max(1, -(-int(windows.points[[one.row for one in places]].sum()) // most))
+    clouds = read_clouds(output, places, windows, stride)
+    if scans is not None or stride > 1 or not clouds:
+        return clouds
+    chars = [one.chars for one in clouds]
+    room = max(0, _MOST_CHARS - sum(chars)) // max(1, *chars)
+    if room:
+        more = choose_places(windows, len(places) + room)
+        clouds += read_clouds(output, [one for one in more if one not in places], windows)
+    return sorted(clouds, key=lambda one: one.place.row)
 
 
-def choose_places(windows: Windows) -> list[Place]:
-    """The first, middle and worst window; each once."""
-    titles: dict[int, list[str]] = {}
-    row = windows.worst()
-    is_whole = windows.fill[row].min() >= 1.0
-    worst = "fewest points" if is_whole else "worst"
-    first = int(windows.has_head and len(windows) > 1)
-    chosen = (("first", first), ("middle", len(windows) // 2), (worst, row))
-    for title, row in chosen:
-        titles.setdefault(row, []).append(title)
+def choose_places(windows: Windows, scans: int) -> list[Place]:
+    """The worst, first and middle window, and others at equal distances, in order.
+
+    scans: number, 0 for all.
+    """
+    worst_row = windows.worst()
+    is_whole = windows.fill[worst_row].min() >= 1.0
+    first_row = int(windows.has_head and len(windows) > 1)
+    named = (
+        ("fewest points" if is_whole else "worst", worst_row),
+        ("first", first_row),
+        ("middle", len(windows) // 2),
+    )
+    rows = list(range(len(windows)))
+    titles: dict[int, list[str]] = {row: [] for row in rows}
+    for title, row in named:
+        titles[row].append(title)
+    if scans and scans < len(rows):
+        kept = list(dict.fromkeys(row for _, row in named))[:scans]
+        others = [row for row in rows[first_row:] if row not in kept]
+        spread = np.linspace(0, len(others) - 1, min(len(others), scans - len(kept)))
+        rows = sorted(kept + [others[i] for i in np.rint(spread).astype(int).tolist()])
     return [
         Place(
-            " and ".join(names),
+            " and ".join(titles[row]),
             row,
             int(windows.index[row]),
             int(windows.slice[row]),
             int(windows.start_ns[row]),
         )
-        for row, names in titles.items()
+        for row in rows
     ]
 
 
-def read_clouds(output: Path, places: list[Place], sensors: tuple[str, ...]) -> list[PageCloud]:
-    """The scans of an output at some places. Raises VerifyError if it cannot be read."""
-    parts: dict[int, list[StoredScan]] = {}
-    try:
-        for scan in _scans(output, places, sensors):
-            parts.setdefault(scan.start_ns, []).append(scan)
-    except DamageError as err:
-        raise VerifyError(f"{output}: {err}") from err
-    most = MOST_POINTS // max(1, len(places))
-    return [
-        _thinned(place, parts[place.start_ns], most) for place in places if place.start_ns in parts
-    ]
+def read_clouds(
+    output: Path, places: list[Place], windows: Windows, stride: int = 1
+) -> list[PageCloud]:
+    """The scans of an output at some places; stride: every nth column of them.
+
+    Raises VerifyError if the output cannot be read.
+    """
+    clouds: list[PageCloud] = []
+    for begin in range(0, len(places), _AT_ONCE):
+        some = places[begin : begin + _AT_ONCE]
+        parts: dict[int, list[StoredScan]] = {}
+        try:
+            for scan in _scans(output, some, windows.sensors):
+                parts.setdefault(scan.start_ns, []).append(scan)
+        except DamageError as err:
+            raise VerifyError(f"{output}: {err}") from err
+        clouds += [
+            page_cloud(place, parts[place.start_ns], windows, stride)
+            for place in some
+            if place.start_ns in parts
+        ]
+    return clouds
 
 
 # -- containers -------------------------------------------------------------------------------
@@ -196,118 +208,3 @@ def _bag_messages(file: Path, places: list[Place], topics: list[str]) -> Iterato
                     publish_ns=stamp_ns,
                     data=data,
                 )
-
-
-# -- points -----------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True, slots=True)
-class _Points:
-    """Valid points of one stored scan."""
-
-    xyz: F32Array
-    lidar: U8Array | None
-    time_ns: F64Array | None
-    intensity: F64Array | None
-
-
-def _valid(scan: StoredScan) -> _Points:
-    finite: BoolArray = np.isfinite(scan.xyz)
-    valid = np.asarray(finite.all(axis=-1))
-    count = int(np.count_nonzero(valid))
-    lidar: U8Array | None = None
-    if scan.sensor is not None:
-        lidar = np.full(count, scan.sensor, dtype=np.uint8)
-    elif scan.lidar_id is not None:
-        # In an organized scan, of the columns.
-        ids = scan.lidar_id if scan.lidar_id.ndim == valid.ndim else scan.lidar_id[:, None]
-        lidar = np.broadcast_to(ids, valid.shape)[valid]
-    bright = scan.intensity if scan.intensity is not None else scan.byte_intensity
-    return _Points(
-        scan.xyz[valid],
-        lidar,
-        None if scan.time_ns is None else scan.time_ns[valid].astype(np.float64),
-        None if bright is None else bright[valid].astype(np.float64),
-    )
-
-
-def _thinned(place: Place, scans: list[StoredScan], most: int) -> PageCloud:
-    """Join the scans of a window and keep at most `most` points, drawn at random."""
-    parts = [_valid(scan) for scan in scans]
-    xyz: F64Array = np.concatenate([part.xyz for part in parts]).astype(np.float64)
-    total = len(xyz)
-    kept = np.arange(total)
-    if total > most:
-        # Every nth point would miss whole channels.
-        kept = np.sort(np.random.default_rng(_SEED).choice(total, most, replace=False))
-    lidars = [part.lidar for part in parts if part.lidar is not None]
-    times = [part.time_ns for part in parts if part.time_ns is not None]
-    bright = [part.intensity for part in parts if part.intensity is not None]
-    none = np.zeros(total)
-    has_lidar = len(lidars) == len(parts)
-    has_time = len(times) == len(parts)
-    has_intensity = len(bright) == len(parts)
-    lidar: U8Array = np.concatenate(lidars) if has_lidar else none.astype(np.uint8)
-    time_ns: F64Array = np.concatenate(times) if has_time else none
-    intensity: F64Array = np.concatenate(bright) if has_intensity else none
-    xyz = xyz[kept]
-    low_m: F64Array = xyz.min(axis=0) if len(xyz) else np.zeros(3)
-    high_m: F64Array = xyz.max(axis=0) if len(xyz) else np.zeros(3)
-    size_m = max(float((high_m - low_m).max()), 1e-3)
-    centre_m, view_m = _view(xyz, lidar[kept])
-    return PageCloud(
-        place=place,
-        total=total,
-        low_m=(float(low_m[0]), float(low_m[1]), float(low_m[2])),
-        size_m=size_m,
-        xyz=np.rint((xyz - low_m) / size_m * _WORD).astype(np.uint16),
-        lidar=lidar[kept],
-        time=_byte(time_ns[kept], 0.0, float(time_ns.max(initial=0.0))),
-        intensity=_byte(intensity[kept], *_span(intensity[kept])),
-        height_m=_span(xyz[:, 2]),
-        centre_m=(float(centre_m[0]), float(centre_m[1]), float(centre_m[2])),
-        view_m=view_m,
-        has_lidar=has_lidar,
-        has_time=has_time,
-        has_intensity=has_intensity,
-    )
-
-
-def _view(xyz: F64Array, lidar: U8Array) -> tuple[F64Array, float]:
-    """Centre (3,) and radius of a view, m, that has most points of every lidar.
-
-    The centre is the body; where the cloud is farther away than it is large, it is that of the
-    cloud.
-    """
-    parts = [xyz[lidar == number] for number in np.unique(lidar)]
-    if not parts:
-        return np.zeros(3), 1.0
-    boxes = np.array([[_span(part[:, axis]) for axis in range(3)] for part in parts])
-    low_m = boxes[:, :, 0].min(axis=0)
-    high_m = boxes[:, :, 1].max(axis=0)
-    centre_m: F64Array = (low_m + high_m) / 2
-    if np.linalg.norm(centre_m) <= np.linalg.norm(high_m - low_m):
-        centre_m = np.zeros(3)
-    away_m = [np.linalg.norm(part[:, :2] - centre_m[:2], axis=1) for part in parts]
-    return centre_m, max(1.0, *(_quantile(away, _IN_VIEW) for away in away_m))
-
-
-def _quantile(values: F64Array, share: float) -> float:
-    """A value of the array by nearest rank; 0 without one."""
-    if not len(values):
-        return 0.0
-    return float(np.sort(values)[int(share * (len(values) - 1))])
-
-
-def _span(values: F64Array) -> tuple[float, float]:
-    return _quantile(values, _LOW), _quantile(values, _HIGH)
-
-
-def _byte(values: F64Array, low: float, high: float) -> U8Array:
-    width = high - low if high > low else 1.0
-    return np.rint(np.clip((values - low) / width, 0.0, 1.0) * _BYTE).astype(np.uint8)
-
-
-def window_ms(windows: Windows, place: Place) -> float:
-    """Length of a window, ms."""
-    return int(windows.end_ns[place.row] - windows.start_ns[place.row]) / NS_PER_S * 1000.0

@@ -9,6 +9,7 @@ import base64
 import hashlib
 import json
 import math
+import re
 from collections.abc import Sequence
 from pathlib import PurePath
 from typing import Any
@@ -16,15 +17,18 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from mlbatch.arrays import F64Array
-from mlbatch.clocks.timescale import describe_time
+from mlbatch.arrays import F64Array, I64Array
+from mlbatch.clocks.timescale import DESCRIPTION, describe_time
 from mlbatch.outputs.damage import VerifyError
-from mlbatch.page.clouds import PageCloud, choose_places, read_clouds, window_ms
+from mlbatch.page.clouds import chosen_clouds
 from mlbatch.page.findings import Finding, Level, findings, number, percent, verdict
+from mlbatch.page.points import PageCloud
 from mlbatch.page.source import Source
 from mlbatch.page.templates import Verdict, asset, render
 from mlbatch.page.windows import Windows, read_windows, summarise
-from mlbatch.report.report import RunReport, SensorReport
+from mlbatch.page.words import COSTS, MEANINGS, SERVICES
+from mlbatch.report.report import RunReport, SensorReport, Unassigned
+from mlbatch.units import NS_PER_MS
 
 _WORDS = {
     Level.GOOD: ("good", "OK"),
@@ -37,30 +41,17 @@ _GOOD_PARTS = frozenset({"accepted", "written"})
 _NEUTRAL_PARTS = frozenset(
     {"no_return", "range", "box", "repeated", "head", "tail", "outside_time", "duplicate"}
 )
-_MEANINGS = {
-    "accepted": "accepted",
-    "written": "in the output",
-    "lost": "never received",
-    "no_return": "no return",
-    "range": "outside the range limits",
-    "box": "in an excluded box",
-    "repeated": "repeated return",
-    "head": "before the first whole window",
-    "tail": "after the last whole window",
-    "before_start": "before all sensors had started",
-    "outside_time": "outside --start and --end",
-    "late": "late",
-    "invalid": "marked invalid by the sensor",
-    "incomplete": "in a window left out as incomplete",
-    "bad_size": "bad size",
-    "bad_header": "bad header",
-    "bad_crc": "bad checksum",
-    "bad_stamp": "bad timestamp",
-    "duplicate": "duplicate",
-}
-# Outcomes of points, and costs of a run, in the order of the page.
+# Outcomes of points, in the order of the page.
 _OUTCOMES = ("written", "no_return", "range", "box", "repeated")
-_COSTS = ("wall_s", "cpu_s", "read_s", "decode_s", "merge_s", "write_s", "peak_rss_mb")
+# A speed over less is that of the start.
+_LEAST_RATED_S = 10.0
+# `ClockEstimate.describe`.
+_ESTIMATE = re.compile(r"clock: .* to the capture host (\(\+-[\d.]+ ms\))(?:, drift [^,;]*)?")
+# Least height of an axis; what varies less is no plot but one line.
+_FLOORS_MS = {"gap": 1.0, "span": 1.0, "delay": 5.0}
+_FLAT_POINTS = 0.02  # of the largest
+# Between two scans that are played.
+_PLAY_MS = (100, 500)
 # Colours of points: key of the plots, name.
 _COLOURS = {"lidar": "lidar", "height": "height", "time": "time", "bright": "intensity"}
 _NO_SCANS = "The scans are not available to this page: give the output itself."
@@ -72,9 +63,7 @@ def page_text(source: Source) -> str:
     windows = None if source.table is None else read_windows(source.table, report.slices)
     clouds, why_no_clouds = _clouds(source, windows)
     found = findings(report, windows)
-    script = asset("page.js")
-    clocks = [sensor.clock for sensor in report.sensors]
-    timing = report.timing
+    script = asset("viewer.js") + asset("page.js")
     lacking = {
         "lidar": not all(cloud.has_lidar for cloud in clouds),
         "time": not all(cloud.has_time for cloud in clouds),
@@ -92,18 +81,18 @@ def page_text(source: Source) -> str:
         cards=_cards(report),
         findings=[_finding(one) for one in found],
         timeline=None if windows is None else _timeline(windows),
-        clouds=[{"title": one.place.title.capitalize(), "text": _caption(one)} for one in clouds],
+        clouds=clouds,
+        about_clouds=_about_clouds(clouds, windows),
         why_no_clouds=why_no_clouds,
         colours=_COLOURS,
         lacking=[name for name, is_absent in lacking.items() if is_absent],
         accounts=_accounts(report),
-        clocks=list(map(_clock, report.sensors)),
-        has_drift=report.recorded_s and any(one.drift_ppm is not None for one in clocks),
+        clocks=[_clock(sensor, report.recorded_s) for sensor in report.sensors],
         sensors=list(map(_sensor, report.sensors)),
         inputs=[(one.path, one.container, f"{one.bytes / 1e6:,.1f} MB") for one in report.inputs],
-        unassigned=[(one.stream, f"{one.packets:,}", one.what) for one in report.unassigned],
+        unassigned=[(one.stream, f"{one.packets:,}", _sender(one)) for one in report.unassigned],
         topics=[(one.topic, f"{one.read:,}", f"{one.written:,}") for one in report.messages],
-        costs={} if timing is None else {key: f"{getattr(timing, key):.2f}" for key in _COSTS},
+        costs=_costs(report),
     )
 
 
@@ -129,7 +118,7 @@ def _clouds(source: Source, windows: Windows | None) -> tuple[list[PageCloud], s
     if source.output is None:
         return [], _NO_SCANS
     try:
-        clouds = read_clouds(source.output, choose_places(windows), windows.sensors)
+        clouds = chosen_clouds(source.output, windows, source.scans)
     except VerifyError as err:
         return [], f"The scans could not be read: {err}"
     return clouds, _NO_SCANS
@@ -171,20 +160,28 @@ def _seconds(seconds: float) -> str:
 
 
 def _cards(report: RunReport) -> dict[str, str]:
+    """Five figures; by their names."""
     scans = report.scans
     span = scans.span_ms.p50
-    timing = report.timing
     packets = [sensor.ledger.packets for sensor in report.sensors]
+    rejected = sum(sum(one.rejected.values()) for one in packets)
     return {
-        "scans": f"{scans.written:,}",
-        "incomplete": f"{scans.incomplete:,}",
+        f"scans, {scans.incomplete:,} incomplete": f"{scans.written:,}",
         "points": _short(scans.points),
-        "lost packets": f"{sum(one.lost for one in packets):,}",
-        "rejected packets": f"{sum(sum(one.rejected.values()) for one in packets):,}",
+        f"packets lost, {rejected:,} rejected": f"{sum(one.lost for one in packets):,}",
         "set span, median": "" if span is None else f"{span:.1f} ms",
-        "clock": report.timescale,
-        "times real time": "" if timing is None else f"{timing.realtime_factor:.1f}",
+        "time of the stamps": DESCRIPTION.get(report.timescale, report.timescale),
     }
+
+
+def _costs(report: RunReport) -> dict[str, str]:
+    timing = report.timing
+    if timing is None:
+        return {}
+    costs = {name: f"{getattr(timing, key):.2f}" for key, name in COSTS.items()}
+    if report.recorded_s and report.recorded_s >= _LEAST_RATED_S:
+        costs["times real time"] = f"{timing.realtime_factor:.1f}"
+    return costs
 
 
 def _short(count: int) -> str:
@@ -208,19 +205,78 @@ def _finding(one: Finding) -> dict[str, str]:
 def _timeline(windows: Windows) -> dict[str, object]:
     sensors = zip(windows.sensors, windows.estimated, strict=True)
     far_ms = windows.far_ms
+    less = f" (less {far_ms / 1000:,.0f} s: the clocks differ)" if far_ms else ""
+    delay = f"Delay: receive time of the packet that closed a window, after its end, ms{less}"
+    span = "Set span: first to last column of a scan, ms"
+    is_whole = bool((windows.fill == 1).all() and windows.complete.all())
+    is_whole &= bool((np.diff(windows.step) == 1).all())
+    lowest = f"lowest fill {percent(float(windows.fill.min(initial=1)), 1)}"
+    columns = "every column received" if is_whole else lowest
+    most = float(windows.points.max(initial=1))
+    series = (
+        ("timeline", "", columns, is_whole, len(windows.sensors)),
+        ("gap", "Longest time without a column, ms", *_range("gap", windows.gap_ms)),
+        ("points", "Points of a scan", *_range("points", windows.points, _FLAT_POINTS * most)),
+        ("span", span, *_range("span", windows.span_ms)),
+        ("delay", delay, *_range("delay", windows.delay_ms - far_ms)),
+    )
+    flat = [(words, count) for _, _, words, is_flat, count in series if is_flat]
+    count = sum(count for _, count in flat)
     return {
         "group": summarise(windows).group,
         "estimated": [name for name, is_estimated in sensors if is_estimated],
-        "far_s": f"{far_ms / 1000:,.0f}" if far_ms else "",
+        "plots": [(key, title, words) for key, title, words, is_flat, _ in series if not is_flat],
+        "flat": f"{number(count, 'series', 'series')}, {'all ' if count > 1 else ''}constant: "
+        f"{'; '.join(words for words, _ in flat)}."
+        if flat
+        else "",
     }
 
 
+def _range(
+    key: str, values: F64Array | I64Array, floor: float | None = None
+) -> tuple[str, bool, int]:
+    """Smallest to largest value in words, whether no series varies by more, number of series."""
+    name, unit, digits = {
+        "gap": ("longest gap", " ms", 2),
+        "points": ("points per scan", "", 0),
+        "span": ("set span", " ms", 1),
+        "delay": ("delay", " ms", 1),
+    }[key]
+    series = values.reshape(len(values), -1)
+    known = series[np.isfinite(series).all(axis=1)]
+    if not len(known):
+        return f"{name} not recorded", True, series.shape[1]
+    low, high = (f"{one:,.{digits}f}" for one in (float(known.min()), float(known.max())))
+    least = _FLOORS_MS[key] if floor is None else floor
+    is_flat = len(known) == len(series) and bool((np.ptp(known, axis=0) <= least).all())
+    return f"{name} {low if low == high else f'{low} to {high}'}{unit}", is_flat, series.shape[1]
+
+
+def _about_clouds(clouds: list[PageCloud], windows: Windows | None) -> str:
+    if not clouds or windows is None:
+        return ""
+    first = clouds[0]
+    kept = "all points" if first.stride == 1 else f"every {_ordinal(first.stride)} column"
+    kilobytes = sum(one.chars for one in clouds) / len(clouds) / 1000
+    step_mm = max(one.step_m for one in clouds) * 1000
+    return (
+        f"{len(clouds):,} of {number(len(windows), 'scan')}, {kept}, {kilobytes:,.0f} kB per scan; "
+        f"coordinates rounded to {step_mm:.0f} mm."
+    )
+
+
+def _ordinal(count: int) -> str:
+    ends = {1: "st", 2: "nd", 3: "rd"}
+    return f"{count}{'th' if count % 100 in (11, 12, 13) else ends.get(count % 10, 'th')}"
+
+
 def _caption(cloud: PageCloud) -> str:
-    place = cloud.place
-    shown = len(cloud.xyz)
-    part = "" if shown == cloud.total else f", {shown:,} of them drawn"
-    sliced = f" slice {place.slice}" if place.slice else ""
-    return f"scan {place.index}{sliced}, {number(cloud.total, 'point')}{part}"
+    part = "" if cloud.shown == cloud.total else f", {cloud.shown:,} of them shown"
+    title = f"{cloud.place.title}, " if cloud.place.title else ""
+    away_m = math.hypot(*cloud.centre_m)
+    away = f"; the view is centred {away_m:,.0f} m from the body" if away_m else ""
+    return f"{title}{number(cloud.total, 'point')}{part}{away}"
 
 
 def _accounts(report: RunReport) -> dict[str, dict[str, list[dict[str, object]]]]:
@@ -253,25 +309,39 @@ def _shares(counts: dict[str, int]) -> list[dict[str, object]]:
             kind = "p-good"
         elif key in _NEUTRAL_PARTS:
             kind = "p-neutral"
-        mark = f"{kind} r-{key}" if key in _MEANINGS else kind
-        text = f"{_MEANINGS.get(key, key)} {count:,} ({percent(count, total)})"
+        mark = f"{kind} r-{key}" if key in MEANINGS else kind
+        text = f"{MEANINGS.get(key, key)} {count:,} ({percent(count, total)})"
         shares.append({"mark": mark, "share": count / total, "text": text})
     return shares
 
 
-def _clock(sensor: SensorReport) -> tuple[str, ...]:
+def _clock(sensor: SensorReport, recorded_s: float) -> tuple[str, ...]:
     clock = sensor.clock
     offset = clock.offset_to_host_ms
-    drift = clock.drift_ppm
+    ppm = clock.drift_ppm
+    # The estimate in words repeats offset and drift; its range and what follows are new.
+    notes = [_ESTIMATE.sub("", note).lstrip(",; ") for note in clock.notes]
+    estimate = next(filter(None, map(_ESTIMATE.match, clock.notes)), None)
+    drift = "not determined"
+    if ppm is not None:
+        drift = f"{ppm:+.2f} ppm"
+        if recorded_s:
+            drift += f", {ppm * recorded_s / 1000:+.2f} ms in {_seconds(recorded_s)}"
     return (
         sensor.name,
         clock.source,
-        clock.epoch,
-        "" if offset is None else _offset(offset),
-        "not determined" if drift is None else f"{drift:+.2f} ppm",
-        "" if drift is None else f"{drift * 3.6:+.1f} ms/h",
-        "; ".join(clock.notes),
+        DESCRIPTION.get(clock.epoch, clock.epoch),
+        "" if offset is None else f"{_offset(offset)} {'' if estimate is None else estimate[1]}",
+        drift,
+        "; ".join(filter(None, notes)),
     )
+
+
+def _sender(stream: Unassigned) -> str:
+    """What a stream of no sensor is; of unknown packets what their port is for."""
+    port = re.search(r"port (\d+)", stream.stream)
+    service = SERVICES.get(int(port[1])) if port else None
+    return stream.what.replace("unknown", service, 1) if service else stream.what
 
 
 def _offset(offset_ms: float) -> str:
@@ -323,8 +393,6 @@ def _plot_data(
     sensors = report.sensors
     data: dict[str, Any] = {
         "sensors": [sensor.name for sensor in sensors],
-        "recorded_s": report.recorded_s or None,
-        "drift_ppm": [sensor.clock.drift_ppm for sensor in sensors],
         "poses": [
             None if (pose := _pose(sensor)) is None else pose[:3].ravel().tolist()
             for sensor in sensors
@@ -335,23 +403,31 @@ def _plot_data(
     if windows is None:
         return data
     data["windows"] = _window_data(windows)
-    data["clouds"] = [
-        {
-            "title": f"{cloud.place.title} scan ({cloud.place.index})",
-            "low": cloud.low_m,
-            "size": cloud.size_m,
-            "xyz": _packed(cloud.xyz),
-            "lidar": _packed(cloud.lidar),
-            "time": _packed(cloud.time),
-            "bright": _packed(cloud.intensity),
-            "height": cloud.height_m,
-            "centre": cloud.centre_m,
-            "view": cloud.view_m,
-            "window_ms": window_ms(windows, cloud.place),
-        }
-        for cloud in clouds
-    ]
+    data["clouds"] = [_cloud_data(one, windows) for one in clouds]
+    between_ms = np.diff([one.place.start_ns for one in clouds]) / NS_PER_MS
+    apart_ms = float(np.median(between_ms)) if len(between_ms) else 0.0
+    # The head of a run, before its first whole window, is chosen by hand.
+    data["begin"] = next((i for i, one in enumerate(clouds) if "first" in one.place.title), 0)
+    data["play_ms"] = min(max(_PLAY_MS[0], apart_ms), _PLAY_MS[1])
     return data
+
+
+def _cloud_data(cloud: PageCloud, windows: Windows) -> dict[str, Any]:
+    place = cloud.place
+    sliced = f" slice {place.slice}" if place.slice else ""
+    return {
+        "title": f"Scan {place.index}{sliced}, +{windows.seconds(place.row):.1f} s",
+        "text": _caption(cloud),
+        "shown": cloud.shown,
+        "low": cloud.low_m,
+        "step": cloud.step_m,
+        "height": cloud.height_m,
+        "centre": cloud.centre_m,
+        "view": cloud.view_m,
+        "window_ms": cloud.window_ms,
+        "has": {"lidar": cloud.has_lidar, "time": cloud.has_time, "ring": cloud.has_ring},
+        "data": base64.b64encode(cloud.packed).decode(),
+    }
 
 
 def _window_data(windows: Windows) -> dict[str, Any]:
@@ -369,6 +445,7 @@ def _window_data(windows: Windows) -> dict[str, Any]:
         "period_ms": period_ms,
         "first_index": int(windows.index[0]),
         "slices": windows.slices,
+        "floors": _FLOORS_MS,
         "step": _packed(found.step - found.step[0]),
         "count": _packed(found.count),
         "incomplete": _packed(found.incomplete),

@@ -10,6 +10,7 @@ import numpy as np
 
 from mlbatch.arrays import BoolArray
 from mlbatch.page.windows import Windows
+from mlbatch.page.words import MEANINGS
 from mlbatch.report.report import RunReport
 
 _NETWORK = (
@@ -226,7 +227,9 @@ def _packets(report: RunReport) -> Iterator[Finding]:
         }
         total = sum(rejected.values())
         if total:
-            reasons = ", ".join(f"{reason} {count:,}" for reason, count in rejected.items())
+            reasons = ", ".join(
+                f"{MEANINGS.get(reason, reason)} {count:,}" for reason, count in rejected.items()
+            )
             text = f"{number(total, 'packet')} of {name} rejected ({reasons})."
             yield Finding(_level(total, sent), text, REMEDIES["rejected"])
 

@@ -1,53 +1,20 @@
-"use strict";
-// Plots of a run; the data are in the element `data`, see document.py.
+// Plots and scans of a run; the data are in the element `data`, see document.py.
 (function () {
   const data = JSON.parse(document.getElementById("data").textContent);
   const byId = (id) => document.getElementById(id);
   const tip = byId("tip");
-  const PALETTE = ["#2f7ed8", "#e8743b", "#19a979", "#945ecf", "#d9a404", "#ed4a7b", "#13a4b4",
-    "#6c8893"];
   const redraws = [];
-  let style = getComputedStyle(document.documentElement);
-  const color = (name) => style.getPropertyValue("--" + name).trim();
-  const sensorColor = (i) => PALETTE[i % PALETTE.length];
 
   function unpack(packed) {
     if (!packed || packed.type === "none") return null;
-    const text = atob(packed.data);
-    const bytes = new Uint8Array(text.length);
-    for (let i = 0; i < text.length; i++) bytes[i] = text.charCodeAt(i);
     const Kind = { u1: Uint8Array, u2: Uint16Array, u4: Uint32Array }[packed.type];
-    const words = new Kind(bytes.buffer);
+    const words = new Kind(bytesOf(packed.data).buffer);
     if (packed.step === undefined) return words;
     const values = new Float32Array(words.length);
     for (let i = 0; i < words.length; i++) {
       values[i] = words[i] === 65535 ? NaN : packed.low + words[i] * packed.step;
     }
     return values;
-  }
-
-  // A canvas at the resolution of the screen; gives its context and size in CSS pixels.
-  function prepared(canvas, height) {
-    if (height) canvas.style.height = height + "px";
-    const scale = window.devicePixelRatio || 1;
-    const width = canvas.clientWidth;
-    const high = canvas.clientHeight;
-    canvas.width = Math.max(1, Math.round(width * scale));
-    canvas.height = Math.max(1, Math.round(high * scale));
-    const ctx = canvas.getContext("2d");
-    ctx.setTransform(scale, 0, 0, scale, 0, 0);
-    ctx.clearRect(0, 0, width, high);
-    ctx.font = '12px system-ui, "Segoe UI", Roboto, "DejaVu Sans", sans-serif';
-    ctx.textBaseline = "alphabetic";
-    return { ctx, width, height: high };
-  }
-
-  // Round steps of an axis: 1, 2 or 5 times a power of ten.
-  function niceStep(span, count) {
-    const raw = span / Math.max(1, count);
-    const power = Math.pow(10, Math.floor(Math.log10(raw)));
-    const factor = [1, 2, 5, 10].find((one) => one * power >= raw);
-    return factor * power;
   }
 
   function digitsOf(step) {
@@ -244,29 +211,12 @@
         if (rows.incomplete[row]) { ctx.fillRect(x, y, 1, 3); break; }
       }
     });
+  }
+
+  function sayRange() {
     const digits = stepS < 1 ? 1 : 0;
     byId("range").textContent = timeText(view.from * stepS, digits) + " to " +
       timeText(view.to * stepS, digits);
-  }
-
-  const RAMP = [[0, 165, 0, 38], [.25, 244, 109, 67], [.6, 254, 224, 139], [.97, 116, 173, 209],
-    [1, 43, 108, 176]];
-
-  function rampOf(value) {
-    let k = 1;
-    while (k < RAMP.length - 1 && value > RAMP[k][0]) k++;
-    const a = RAMP[k - 1], b = RAMP[k];
-    const s = Math.max(0, Math.min(1, (value - a[0]) / (b[0] - a[0])));
-    const part = (j) => Math.round(a[j] + s * (b[j] - a[j]));
-    return "rgb(" + part(1) + "," + part(2) + "," + part(3) + ")";
-  }
-
-  function drawFill(canvas) {
-    const high = 18;
-    lanes(canvas, high, (ctx, i, x, top, range) => {
-      ctx.fillStyle = rampOf(lowestFill(i, range));
-      ctx.fillRect(x, top, 1, high);
-    });
   }
 
   function laneAt(y, high) {
@@ -284,7 +234,8 @@
 
   // -- lines over time --------------------------------------------------------------------------
 
-  function drawLines(canvas, series, colors, fromZero) {
+  // floor: least height of the axis, so that noise is no cliff; 0: an axis from 0.
+  function drawLines(canvas, series, colors, floor) {
     const size = prepared(canvas, 120);
     const ctx = size.ctx, bottom = size.height - 18, top = 6;
     timeAxis(ctx, size.width, top, bottom);
@@ -305,9 +256,9 @@
       ctx.fillText("not recorded in scans.csv", 10, (top + bottom) / 2);
       return;
     }
-    if (fromZero) low = Math.min(0, low);
-    const pad = (high - low) * .08 || Math.max(1, Math.abs(high) * .1);
-    if (!fromZero) low -= pad;
+    if (!floor) low = Math.min(0, low);
+    const pad = Math.max((high - low) * .08, (floor - (high - low)) / 2) || 1;
+    if (floor) low -= pad;
     high += pad;
     const yOf = (value) => bottom - (value - low) / (high - low) * (bottom - top);
     const label = valueAxis(ctx, size.width, low, high, yOf);
@@ -362,255 +313,23 @@
     });
   }
 
-  // -- clocks -----------------------------------------------------------------------------------
+  // -- scans ------------------------------------------------------------------------------------
 
-  function drawDrift(canvas) {
-    const size = prepared(canvas, 170);
-    const ctx = size.ctx, bottom = size.height - 20, top = 8;
-    const span = data.recorded_s;
-    const ends = data.drift_ppm.map((ppm) => ppm === null ? null : ppm * span / 1000);
-    const known = ends.filter((end) => end !== null);
-    let low = Math.min(0, ...known), high = Math.max(0, ...known);
-    const pad = (high - low) * .12 || 1;
-    low -= pad;
-    high += pad;
-    const right = size.width - 8;
-    const yOf = (value) => bottom - (value - low) / (high - low) * (bottom - top);
-    valueAxis(ctx, size.width, low, high, yOf)();
-    const step = niceStep(span, size.width / 90);
-    ctx.fillStyle = color("soft");
-    for (let t = 0; t <= span; t += step) {
-      const text = timeText(t, digitsOf(step));
-      const x = t / span * right;
-      ctx.fillText(text, Math.min(x, size.width - ctx.measureText(text).width), bottom + 14);
+  const clouds = data.clouds;
+  let chosen = 0, colouring = "height", playing = null;
+  const unpackings = new Map();
+
+  // The points of a scan; a few of them stay unpacked.
+  function pointsOf(number) {
+    if (!unpackings.has(number)) {
+      unpackings.set(number, unpackCloud(clouds[number]));
+      if (unpackings.size > 12) unpackings.delete(unpackings.keys().next().value);
     }
-    const labels = [];
-    ends.forEach((end, i) => {
-      if (end === null) return;
-      ctx.strokeStyle = sensorColor(i);
-      ctx.lineWidth = 2;
-      ctx.beginPath();
-      ctx.moveTo(0, yOf(0));
-      ctx.lineTo(right, yOf(end));
-      ctx.stroke();
-      labels.push({ y: yOf(end), i, text: data.sensors[i] + "  " + (end < 0 ? "" : "+") +
-        end.toFixed(3) + " ms" });
-    });
-    labels.sort((a, b) => a.y - b.y);
-    labels.forEach((one, k) => {
-      one.y = Math.max(one.y - 6, k ? labels[k - 1].y + 14 : 14);
-    });
-    const over = labels.length ? labels[labels.length - 1].y - (bottom - 4) : 0;
-    labels.forEach((one) => {
-      const y = over > 0 ? one.y - over : one.y;
-      const x = right - ctx.measureText(one.text).width - 6;
-      ctx.lineWidth = 4;
-      ctx.strokeStyle = color("panel");
-      ctx.strokeText(one.text, x, y);
-      ctx.fillStyle = sensorColor(one.i);
-      ctx.fillText(one.text, x, y);
-    });
+    return unpackings.get(number);
   }
 
-  // -- clouds -----------------------------------------------------------------------------------
-
-  const clouds = data.clouds.map((one) => {
-    const words = unpack(one.xyz);
-    const xyz = new Float32Array(words.length);
-    for (let i = 0; i < words.length; i++) {
-      xyz[i] = one.low[i % 3] + words[i] / 65535 * one.size;
-    }
-    return { ...one, xyz, lidar: unpack(one.lidar), time: unpack(one.time),
-      bright: unpack(one.bright) };
-  });
-  // One centre and one scale for all, so that scans compare.
-  const filled = clouds.filter((one) => one.xyz.length);
-  const centre = [0, 1, 2].map((k) =>
-    filled.reduce((sum, one) => sum + one.centre[k] / filled.length, 0));
-  const radius = Math.max(1, ...filled.map((one) => one.view +
-    Math.hypot(one.centre[0] - centre[0], one.centre[1] - centre[1])));
-  let chosen = 0;
-  let colouring = "height";
-  const poses = data.poses.map((pose) => pose);
-
-  // Opaque colours as 32-bit words of an ImageData.
-  const word = (r, g, b) => (255 << 24 | b << 16 | g << 8 | r) >>> 0;
-  const hex = (text) => word(parseInt(text.slice(1, 3), 16), parseInt(text.slice(3, 5), 16),
-    parseInt(text.slice(5, 7), 16));
-  const SCALE = [[68, 60, 150], [49, 104, 180], [33, 145, 150], [70, 180, 90], [215, 185, 40],
-    [235, 110, 50]];
-  const SCALE_WORDS = new Uint32Array(256);
-  for (let i = 0; i < 256; i++) {
-    const at = i / 255 * (SCALE.length - 1);
-    const k = Math.min(SCALE.length - 2, Math.floor(at));
-    const part = (j) => Math.round(SCALE[k][j] + (at - k) * (SCALE[k + 1][j] - SCALE[k][j]));
-    SCALE_WORDS[i] = word(part(0), part(1), part(2));
-  }
-
-  function colorsOf(cloud) {
-    const found = new Uint32Array(cloud.xyz.length / 3);
-    const [low, high] = cloud.height;
-    const span = high > low ? high - low : 1;
-    for (let i = 0; i < found.length; i++) {
-      if (colouring === "lidar") found[i] = hex(sensorColor(cloud.lidar[i]));
-      else if (colouring === "height") {
-        const share = (cloud.xyz[3 * i + 2] - low) / span;
-        found[i] = SCALE_WORDS[Math.round(255 * Math.max(0, Math.min(1, share)))];
-      } else found[i] = SCALE_WORDS[cloud[colouring][i]];
-    }
-    return found;
-  }
-
-  // Draw points through `project(x, y, z) -> [pixel x, pixel y, depth]`; the nearest one is seen.
-  function splat(ctx, cloud, colors, project, big) {
-    const width = ctx.canvas.width, height = ctx.canvas.height;
-    const image = ctx.createImageData(width, height);
-    const pixels = new Uint32Array(image.data.buffer);
-    const depths = new Float32Array(width * height).fill(Infinity);
-    const out = [0, 0, 0];
-    for (let i = 0; i < colors.length; i++) {
-      project(cloud.xyz[3 * i], cloud.xyz[3 * i + 1], cloud.xyz[3 * i + 2], out);
-      const px = Math.round(out[0]), py = Math.round(out[1]);
-      for (let dy = 0; dy < big; dy++) {
-        for (let dx = 0; dx < big; dx++) {
-          const x = px + dx, y = py + dy;
-          if (x < 0 || y < 0 || x >= width || y >= height) continue;
-          const at = y * width + x;
-          if (out[2] < depths[at]) { depths[at] = out[2]; pixels[at] = colors[i]; }
-        }
-      }
-    }
-    ctx.putImageData(image, 0, 0);
-  }
-
-  function drawAxes(ctx, project, scale, length) {
-    const line = (from, to, stroke, wide) => {
-      const a = [0, 0, 0], b = [0, 0, 0];
-      project(from[0], from[1], from[2], a);
-      project(to[0], to[1], to[2], b);
-      ctx.strokeStyle = stroke;
-      ctx.lineWidth = wide;
-      ctx.beginPath();
-      ctx.moveTo(a[0] / scale, a[1] / scale);
-      ctx.lineTo(b[0] / scale, b[1] / scale);
-      ctx.stroke();
-    };
-    const AXES = ["#e23b3b", "#2fa84f", "#3b7de2"];
-    const frame = (pose, size, wide) => {
-      const origin = [pose[3], pose[7], pose[11]];
-      for (let axis = 0; axis < 3; axis++) {
-        const tipOf = [0, 1, 2].map((row) => origin[row] + size * pose[4 * row + axis]);
-        line(origin, tipOf, AXES[axis], wide);
-      }
-      return origin;
-    };
-    frame([1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0], length, 2.5);
-    const labels = [];
-    poses.forEach((pose, i) => {
-      if (!pose) return;
-      const origin = frame(pose, length * .7, 1.5);
-      const at = [0, 0, 0];
-      project(origin[0], origin[1], origin[2], at);
-      const x = at[0] / scale, y = at[1] / scale;
-      ctx.fillStyle = sensorColor(i);
-      ctx.beginPath();
-      ctx.arc(x, y, 4, 0, 2 * Math.PI);
-      ctx.fill();
-      let ly = y - 7;
-      while (labels.some((one) => Math.abs(one.y - ly) < 13 && Math.abs(one.x - x) < 70)) ly -= 13;
-      labels.push({ x, y: ly });
-      ctx.lineWidth = 4;
-      ctx.strokeStyle = color("cloud");
-      ctx.strokeText(data.sensors[i], x + 7, ly);
-      ctx.fillStyle = color("text");
-      ctx.fillText(data.sensors[i], x + 7, ly);
-    });
-  }
-
-  function drawTop(canvas) {
-    const number = Number(canvas.dataset.scan);
-    const cloud = clouds[number];
-    const size = prepared(canvas);
-    const scale = canvas.width / size.width;
-    const zoom = canvas.width / 2 / (radius * 1.08);
-    const half = canvas.width / 2;
-    // x up, y left; what is higher hides what is lower.
-    const project = (x, y, z, out) => {
-      out[0] = half - (y - centre[1]) * zoom;
-      out[1] = half - (x - centre[0]) * zoom;
-      out[2] = -z;
-    };
-    splat(size.ctx, cloud, colorsOf(cloud), project, Math.round(Math.max(1, scale)));
-    const step = niceStep(2 * radius, 4);
-    size.ctx.strokeStyle = color("line");
-    size.ctx.lineWidth = 1;
-    size.ctx.globalCompositeOperation = "destination-over";
-    for (let k = -6; k <= 6; k++) {
-      const at = Math.round((half + k * step * zoom) / scale) + .5;
-      size.ctx.beginPath();
-      size.ctx.moveTo(at, 0);
-      size.ctx.lineTo(at, size.height);
-      size.ctx.moveTo(0, at);
-      size.ctx.lineTo(size.width, at);
-      size.ctx.stroke();
-    }
-    size.ctx.globalCompositeOperation = "source-over";
-    drawAxes(size.ctx, project, scale, radius * .08);
-    const bar = step * zoom / scale;
-    size.ctx.fillStyle = color("soft");
-    size.ctx.fillRect(8, size.height - 10, bar, 2);
-    size.ctx.lineWidth = 4;
-    size.ctx.strokeStyle = color("cloud");
-    size.ctx.strokeText(step + " m", 8, size.height - 15);
-    size.ctx.fillText(step + " m", 8, size.height - 15);
-    canvas.classList.toggle("chosen", number === chosen);
-  }
-
-  const camera = { yaw: -.6, pitch: .55, zoom: 1, moved: false };
-
-  function drawCloud(canvas) {
-    const cloud = clouds[chosen];
-    const size = prepared(canvas);
-    const scale = canvas.width / size.width;
-    const middle = [canvas.width / 2, canvas.height * .55];
-    const distance = radius * 1.8 / camera.zoom;
-    const focal = canvas.height * 1.05;
-    const cosYaw = Math.cos(camera.yaw), sinYaw = Math.sin(camera.yaw);
-    const cosPitch = Math.cos(camera.pitch), sinPitch = Math.sin(camera.pitch);
-    // Camera behind the centre, looking along x at yaw 0; z is up.
-    const project = (x, y, z, out) => {
-      const dx = x - centre[0], dy = y - centre[1], dz = z - centre[2];
-      const ahead = dx * cosYaw + dy * sinYaw;
-      const left = -dx * sinYaw + dy * cosYaw;
-      const depth = distance + ahead * cosPitch - dz * sinPitch;
-      const up = ahead * sinPitch + dz * cosPitch;
-      const factor = depth > .05 ? focal / depth : NaN;
-      out[0] = middle[0] - left * factor;
-      out[1] = middle[1] - up * factor;
-      out[2] = depth;
-    };
-    splat(size.ctx, cloud, cloudColors, project, Math.round(Math.max(1, scale * 1.5)));
-    drawAxes(size.ctx, project, scale, radius * .08);
-  }
-
-  let cloudColors = null;
-
-  function drawClouds() {
-    cloudColors = colorsOf(clouds[chosen]);
-    document.querySelectorAll("canvas.top").forEach(drawTop);
-    drawCloud(byId("cloud"));
-    const away = Math.hypot(...centre);
-    byId("cloudinfo").textContent = "Drawn: the " + clouds[chosen].title + "." +
-      (away ? " The centre of the views is " + away.toFixed(0) + " m from the body." : "");
-    drawLegend();
-    document.querySelectorAll("button[data-colour]").forEach((button) => {
-      button.classList.toggle("chosen", button.dataset.colour === colouring);
-    });
-  }
-
-  function drawLegend() {
+  function drawLegend(cloud) {
     const legend = byId("legend");
-    const cloud = clouds[chosen];
     legend.textContent = "";
     const item = (text, background) => {
       const span = document.createElement("span");
@@ -625,83 +344,110 @@
     if (colouring === "lidar") data.sensors.forEach((name, i) => item(name, sensorColor(i)));
     else if (colouring === "height") {
       // Plus zero: no sign of a rounded zero.
-      item("height " + (Math.round(cloud.height[0] * 10) / 10 + 0).toFixed(1) + " to " + cloud.height[1].toFixed(1) + " m",
-        ramp);
+      const [low, high] = cloud.height.map((one) => (Math.round(one * 10) / 10 + 0).toFixed(1));
+      item("height " + low + " to " + high + " m", ramp);
     } else if (colouring === "time") item("time 0 to " + cloud.window_ms.toFixed(0) + " ms", ramp);
     else item("intensity, 2 % to 98 % of the points", ramp);
   }
 
   function startClouds() {
     if (!clouds.length) return;
-    const canvas = byId("cloud");
-    if (data.sensors.length > 1 &&
-      !document.querySelector("button[data-colour=lidar]").disabled) colouring = "lidar";
-    document.querySelectorAll("button[data-colour]").forEach((button) => {
-      button.addEventListener("click", () => { colouring = button.dataset.colour; drawClouds(); });
-    });
-    document.querySelectorAll("canvas.top").forEach((top) => {
-      const choose = () => { chosen = Number(top.dataset.scan); drawClouds(); };
-      top.addEventListener("click", choose);
-      top.addEventListener("keydown", (event) => { if (event.key === "Enter") choose(); });
-    });
-    let last = null;
-    canvas.addEventListener("pointerdown", (event) => {
-      last = [event.clientX, event.clientY];
-      camera.moved = true;
-      canvas.setPointerCapture(event.pointerId);
-    });
-    canvas.addEventListener("pointermove", (event) => {
-      if (!last) return;
-      camera.yaw -= (event.clientX - last[0]) * .008;
-      camera.pitch += (event.clientY - last[1]) * .006;
-      camera.pitch = Math.max(-.2, Math.min(1.55, camera.pitch));
-      last = [event.clientX, event.clientY];
-      requestAnimationFrame(() => drawCloud(canvas));
-    });
-    canvas.addEventListener("pointerup", () => { last = null; });
-    canvas.addEventListener("wheel", (event) => {
-      event.preventDefault();
-      camera.moved = true;
-      camera.zoom = Math.max(.2, Math.min(30, camera.zoom * Math.exp(-event.deltaY * .0015)));
-      requestAnimationFrame(() => drawCloud(canvas));
-    }, { passive: false });
-    redraws.push(drawClouds);
-    if (matchMedia("(prefers-reduced-motion: reduce)").matches) return;
-    let visible = false;
-    new IntersectionObserver((found) => {
-      const was = visible;
-      visible = found[found.length - 1].isIntersecting;
-      if (visible && !was) requestAnimationFrame(turn);
-    }).observe(canvas);
-    let before = 0;
-    const turn = (now) => {
-      if (!visible || camera.moved) return;
-      if (now - before > 40) {
-        camera.yaw += Math.min(.05, (now - before) * .0002);
-        before = now;
-        drawCloud(canvas);
-      }
-      requestAnimationFrame(turn);
+    const canvas = byId("cloud"), slider = byId("scan"), play = byId("play");
+    const why = byId("cloudwhy");
+    const say = (text) => { why.textContent = text; why.hidden = false; };
+    if (typeof DecompressionStream === "undefined") {
+      say("This browser cannot unpack the points (no DecompressionStream): Chrome 103, " +
+        "Firefox 113, Safari 16.4 and later can.");
+      byId("stage").hidden = true;
+      return;
+    }
+    const viewer = makeViewer(canvas, data.sensors, data.poses, say);
+    const isFree = (colour) => !document.querySelector("[data-colour=" + colour + "]").disabled;
+    if (data.sensors.length > 1 && isFree("lidar")) colouring = "lidar";
+    const show = async (number) => {
+      chosen = number;
+      const cloud = await pointsOf(number);
+      if (chosen !== number) return;
+      viewer.show(cloud, colouring);
+      slider.value = number;
+      slider.setAttribute("aria-valuetext", cloud.title);
+      byId("cloudinfo").textContent = cloud.title + ": " + cloud.text;
+      drawLegend(cloud);
+      document.querySelectorAll("[data-colour]").forEach((button) => {
+        button.setAttribute("aria-pressed", button.dataset.colour === colouring);
+      });
+      document.querySelectorAll("[data-scan]").forEach((button) => {
+        button.setAttribute("aria-pressed", Number(button.dataset.scan) === number);
+      });
+      document.documentElement.dataset.shown = number;
     };
+    const stop = () => {
+      clearTimeout(playing);
+      playing = null;
+      play.textContent = "Play";
+    };
+    const step = async () => {
+      await show((chosen + 1) % clouds.length);
+      if (playing !== null) playing = setTimeout(step, data.play_ms);
+    };
+    const toggle = () => {
+      if (playing !== null) { stop(); return; }
+      play.textContent = "Pause";
+      playing = setTimeout(step, 0);
+    };
+    const choose = (number) => {
+      stop();
+      show(Math.max(0, Math.min(clouds.length - 1, number)));
+    };
+    const colour = (name) => { colouring = name; show(chosen); };
+    document.querySelectorAll("[data-colour]").forEach((button) => {
+      button.addEventListener("click", () => colour(button.dataset.colour));
+    });
+    document.querySelectorAll("[data-scan]").forEach((button) => {
+      button.addEventListener("click", () => choose(Number(button.dataset.scan)));
+    });
+    slider.addEventListener("input", () => choose(Number(slider.value)));
+    play.addEventListener("click", toggle);
+    byId("fit").addEventListener("click", viewer.fit);
+    byId("above").addEventListener("click", viewer.above);
+    byId("full").addEventListener("click", () => {
+      if (document.fullscreenElement) document.exitFullscreen();
+      else byId("viewer").requestFullscreen();
+    });
+    canvas.addEventListener("keydown", (event) => {
+      if (event.ctrlKey || event.altKey || event.metaKey) return;
+      if (event.key === " ") toggle();
+      else if (event.key === "." || event.key === ",") choose(chosen + (event.key === "." ? 1 : -1));
+      else if (event.key === "c") {
+        const names = [...document.querySelectorAll("[data-colour]:enabled")]
+          .map((button) => button.dataset.colour);
+        colour(names[(names.indexOf(colouring) + 1) % names.length]);
+      } else return;
+      event.preventDefault();
+    });
+    new ResizeObserver(viewer.draw).observe(canvas);
+    redraws.push(viewer.draw);
+    show(data.begin);
   }
 
   // -- start ------------------------------------------------------------------------------------
 
-  if (win) {
-    const one = (values, id, unit, fromZero) => addTimePlot(id,
-      (canvas) => drawLines(canvas, [values], [color("note")], fromZero),
+  if (win && byId("range")) {
+    const one = (values, id, unit, floor) => addTimePlot(id,
+      (canvas) => drawLines(canvas, [values], [color("note")], floor),
       (row) => values && !Number.isNaN(values[row]) ? values[row].toFixed(unit ? 3 : 0) + unit
         : "not recorded");
+    timePlots.push(sayRange);
+    redraws.push(sayRange);
     addTimePlot("timeline", drawTimeline, describeFill(40));
-    addTimePlot("fill", drawFill, describeFill(18));
     addTimePlot("gap",
-      (canvas) => drawLines(canvas, rows.gap, rows.gap.map((_, i) => sensorColor(i)), true),
+      (canvas) => drawLines(canvas, rows.gap, rows.gap.map((_, i) => sensorColor(i)), 0),
       (row) => rows.gap.map((values, i) => win.sensors[i] + ": " +
         (values && !Number.isNaN(values[row]) ? values[row].toFixed(3) + " ms" : "none"))
         .join("\n"));
-    one(rows.points, "points", "", true);
-    one(rows.span, "span", " ms", false);
-    one(rows.delay, "delay", " ms", false);
+    one(rows.points, "points", "", 0);
+    one(rows.span, "span", " ms", win.floors.span);
+    one(rows.delay, "delay", " ms", win.floors.delay);
     const zoom = (factor) => {
       const middle = (view.from + view.to) / 2, half = (view.to - view.from) / 2 * factor;
       setView(middle - half, middle + half);
@@ -716,10 +462,8 @@
     byId("on").addEventListener("click", () => move(.5));
     byId("all").addEventListener("click", () => setView(0, total));
   }
-  if (byId("drift")) redraws.push(() => drawDrift(byId("drift")));
   startClouds();
   const drawAll = () => {
-    style = getComputedStyle(document.documentElement);
     drawnWidth = document.body.clientWidth;
     redraws.forEach((draw) => draw());
   };

@@ -22,6 +22,7 @@ class Source:
     table: str | None  # text of scans.csv
     output: Path | None  # None: no scans
     page: Path  # usual place of the page
+    scans: int | None = None  # number to show, 0: all; None: as many as the page has room for
 
 
 def source_of_text(where: Path, text: str | bytes) -> Source:

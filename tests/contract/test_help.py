@@ -23,7 +23,7 @@ OPTIONS: dict[str, set[str]] = {
             start end clock align-clocks align-to on-jump min-range max-range exclude-box
             keep-repeated drop-incomplete pass copy-topic metadata identity-extrinsics
             decode only include-sensor ignore exclude-sensor fault fault-seed html dry-run
-            report shard jobs compression strict fail-on overwrite resume no-fsync quiet
+            html-scans report shard jobs compression strict fail-on overwrite resume no-fsync quiet
             verbose
         """,
         "merge": "output fail-on overwrite no-fsync quiet",
@@ -36,7 +36,7 @@ OPTIONS: dict[str, set[str]] = {
         "compare": "rig rate metadata clock tolerance timeout html figures overwrite verbose json",
         "sensors": "json",
         "verify": "report json verbose",
-        "report": "output report overwrite",
+        "report": "output report html-scans overwrite",
         "simulate": "output duration seed overwrite quiet",
         "schema": "",
         "digest": "output against overwrite",

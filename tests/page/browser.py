@@ -22,7 +22,9 @@ from typing import Any
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
 NO_CHROMIUM = "chromium is not installed (Debian: apt-get install chromium)"
 _FLAGS = (
-    *("--headless", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run"),
+    *("--headless", "--no-sandbox", "--disable-quic", "--no-first-run"),
+    # WebGL on the processor.
+    *("--use-angle=swiftshader", "--enable-unsafe-swiftshader"),
     *("--disable-background-networking", "--disable-component-update", "--disable-sync"),
     *("--disable-dev-shm-usage", "--remote-debugging-pipe"),
 )
@@ -98,6 +100,30 @@ class Browser:
         # Widths settle.
         time.sleep(0.2)
         self.run("0")
+
+    @contextlib.contextmanager
+    def before_pages(self, script: str) -> Iterator[None]:
+        """Run a script in each page before its own."""
+        added = self.call("Page.addScriptToEvaluateOnNewDocument", source=script)
+        yield
+        self.call("Page.removeScriptToEvaluateOnNewDocument", identifier=added["identifier"])
+
+    def press(self, key: str, *, shift: bool = False) -> None:
+        """Press a key, as the page is told of it."""
+        text = {"text": key} if len(key) == 1 else {}
+        for kind in ("keyDown", "keyUp"):
+            self.call("Input.dispatchKeyEvent", type=kind, key=key, modifiers=8 * shift, **text)
+        time.sleep(0.1)
+
+    def hover(self, selector: str, across: float, down: float) -> None:
+        """Point at a place of an element, in shares of its size."""
+        box = self.run(
+            f"(() => {{ const b = document.querySelector({json.dumps(selector)})"
+            ".getBoundingClientRect(); return [b.left, b.top, b.width, b.height]; })()"
+        )
+        x, y = box[0] + across * box[2], box[1] + down * box[3]
+        self.call("Input.dispatchMouseEvent", type="mouseMoved", x=x, y=y)
+        time.sleep(0.2)
 
     def run(self, script: str) -> Any:
         """The value of an expression."""

@@ -112,7 +112,7 @@ def test_the_verdict_is_the_worst_finding() -> None:
     document = report(sensor("left", bad_size=50), sensor("right", 1, lost=2), warnings=[warning])
     level, heading, others = verdict(findings(RunReport.from_json(document), None))
     assert level == Level.PROBLEM
-    assert heading == "50 packets of left rejected (bad_size 50)."
+    assert heading == "50 packets of left rejected (bad size 50)."
     assert others == "1 problem and 1 warning below."
     last = findings(RunReport.from_json(document), None)[-1]
     assert (last.level, last.code, last.text) == (Level.NOTE, "calibration", "a note")

@@ -5,13 +5,17 @@ from __future__ import annotations
 import base64
 import json
 import re
+import zlib
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 import pytest
 
-from mlbatch.page.clouds import _view, choose_places, read_clouds
+from mlbatch.page.clouds import choose_places, chosen_clouds, read_clouds
+from mlbatch.page.points import _view
 from mlbatch.page.windows import read_windows
 from tests.builders.sessions import FIXTURE, Shell
 from tests.page.runs import report, sensor, table, text
@@ -47,6 +51,41 @@ def unpacked(packed: Any) -> Any:
     return np.frombuffer(base64.b64decode(packed["data"]), f"<{packed['type']}")
 
 
+@dataclass
+class Shown:
+    """Points of a page, in the order of the page."""
+
+    xyz: npt.NDArray[np.float64]
+    time_ms: npt.NDArray[np.float64]
+    ring: npt.NDArray[np.int64]
+    lidar: npt.NDArray[np.uint8]
+    intensity: npt.NDArray[np.uint8]
+
+
+def points_of(cloud: Any) -> Shown:
+    """Unpack a scan of a page, one value after another."""
+    data = zlib.decompress(base64.b64decode(cloud["data"]), wbits=-15)
+    count = cloud["shown"]
+    words = []
+    for plane in range(5):
+        low = data[2 * plane * count :]
+        value = 0
+        values = []
+        for i in range(count):
+            coded = low[i] + 256 * low[count + i]
+            value += -(coded + 1) // 2 if coded % 2 else coded // 2
+            values.append(value % 65536)
+        words.append(np.array(values))
+    assert len(data) == 12 * count
+    return Shown(
+        xyz=np.stack(words[:3], axis=1) * cloud["step"] + cloud["low"],
+        time_ms=words[3] / 65535 * cloud["window_ms"],
+        ring=words[4],
+        lidar=np.frombuffer(data, np.uint8, count, 10 * count),
+        intensity=np.frombuffer(data, np.uint8, count, 11 * count),
+    )
+
+
 @pytest.mark.parametrize("case", FORMATS)
 def test_a_page_shows_the_scans_of_every_format(case: str, shell: Shell) -> None:
     output, options = FORMATS[case]
@@ -54,36 +93,94 @@ def test_a_page_shows_the_scans_of_every_format(case: str, shell: Shell) -> None
     outcome = shell(f"report {output} -o page.html")
     assert (outcome.code, outcome.err, outcome.out) == (0, "", "wrote page.html\n")
     clouds = plot_data(Path("page.html"))["clouds"]
-    assert [cloud["title"] for cloud in clouds] == [
-        "first and fewest points scan (0)",
-        "middle scan (3)",
-    ]
-    first = clouds[0]
-    lidars = unpacked(first["lidar"])
+    # All 7, since they are small.
+    assert [cloud["title"] for cloud in clouds] == [f"Scan {k}, +0.{k} s" for k in range(7)]
+    first = points_of(clouds[0])
+    assert len(first.lidar) == POINTS
     # fixtures/two_lidars/SOURCE.md: both lidars have points in every scan.
-    assert len(lidars) == 27_000 < POINTS
-    assert set(lidars.tolist()) == {0, 1}
-    xyz = unpacked(first["xyz"]).reshape(-1, 3) / 65535 * first["size"] + first["low"]
+    assert set(first.lidar.tolist()) == {0, 1}
     # The hall of the fixture; the machine's own box is excluded.
-    assert 5 < np.abs(xyz).max() < 60
+    assert 5 < np.abs(first.xyz).max() < 60
 
 
-def test_points_of_a_page_are_those_of_the_scan(shell: Shell) -> None:
+@pytest.mark.parametrize("case", ["npz", "npz organized", "npz split"])
+def test_points_of_a_page_are_those_of_the_scan(case: str, shell: Shell) -> None:
     assert shell(f"convert {FIX} -o scans --quiet").code == 0
-    windows = read_windows(Path("scans/scans.csv").read_text(encoding="utf-8"), 1)
-    assert windows is not None
-    (cloud, _) = read_clouds(Path("scans"), choose_places(windows), windows.sensors)
-    assert cloud.total == POINTS
-    found = cloud.xyz / 65535 * cloud.size_m + np.array(cloud.low_m)
+    _, options = FORMATS[case]
+    assert shell(f"convert {FIX} -o shown {options} --quiet").code == 0
+    assert shell("report shown -o page.html").code == 0
+    cloud = plot_data(Path("page.html"))["clouds"][0]
+    shown = points_of(cloud)
     with np.load("scans/000000.npz") as scan:
-        xyz = scan["xyz"].astype(np.float64)
-        lidar = scan["lidar_id"]
-    step_m = cloud.size_m / 65535
-    rows = np.random.default_rng(1).choice(len(found), 50, replace=False)
-    for row in rows:
-        far = np.abs(xyz - found[row]).max(axis=1)
-        assert far.min() <= step_m
-        assert cloud.lidar[row] in lidar[far <= step_m]
+        arrays = {name: scan[name] for name in ("xyz", "lidar_id", "ring", "time_ns")}
+    time_ns = arrays["time_ns"].astype(np.int64)
+    assert len(shown.lidar) == len(time_ns) == POINTS
+    # A page has them by lidar and ring.
+    order = np.lexsort((time_ns, arrays["ring"], arrays["lidar_id"]))
+    np.testing.assert_array_equal(shown.lidar, arrays["lidar_id"][order])
+    # The rings of a scan of one sensor begin at 0; both sensors have 32.
+    ring = arrays["ring"] % (32 if case == "npz split" else 64)
+    np.testing.assert_array_equal(shown.ring, ring[order])
+    assert np.abs(shown.xyz - arrays["xyz"][order]).max() <= 0.5 * cloud["step"] + 1e-5
+    assert cloud["step"] == 0.005
+    off_ms = shown.time_ms - time_ns[order] / 1e6
+    assert np.abs(off_ms).max() <= cloud["window_ms"] / 65535
+
+
+@pytest.mark.parametrize(
+    ("words", "count"),
+    [("", 7), ("--html-scans all", 7), ("--html-scans 2", 2), ("--html-scans 90", 7)],
+)
+def test_scans_of_a_page_are_chosen(words: str, count: int, shell: Shell) -> None:
+    assert shell(f"convert {FIX} -o scans --quiet --html page.html {words}").code == 0
+    data = plot_data(Path("page.html"))
+    assert len(data["clouds"]) == count
+    assert "first" in data["clouds"][data["begin"]]["text"]
+    about = f"{count} of 7 scans, all points"
+    assert about in Path("page.html").read_text(encoding="utf-8")
+
+
+@pytest.mark.parametrize("words", ["0", "-1", "many", "1.5", "\u0662"])
+def test_numbers_of_scans_are_checked(words: str, shell: Shell) -> None:
+    outcome = shell(f"convert {FIX} -o scans --html page.html --html-scans={words}")
+    assert outcome.code == 2
+    assert "--html-scans: expected a number of scans from 1 on or all" in outcome.err
+    assert not Path("scans").exists()
+
+
+def test_large_scans_are_thinned_by_whole_columns(
+    shell: Shell, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert shell(f"convert {FIX} -o scans --quiet").code == 0
+    # Two scans (one is first and has the fewest points) in room for one.
+    monkeypatch.setattr("mlbatch.page.clouds._MOST_POINTS", POINTS)
+    assert shell("report scans -o page.html").code == 0
+    text = Path("page.html").read_text(encoding="utf-8")
+    clouds = plot_data(Path("page.html"))["clouds"]
+    assert "2 of 7 scans, every 2nd column" in text
+    assert f"{POINTS:,} points, {clouds[0]['shown']:,} of them shown" in clouds[0]["text"]
+    shown = points_of(clouds[0])
+    # Half of the columns of 512 per revolution, with each ring that the scan has.
+    with np.load("scans/000000.npz") as scan:
+        assert set(shown.ring.tolist()) == set(scan["ring"].tolist())
+    of_ring = shown.time_ms[shown.ring == shown.ring[0]]
+    assert np.diff(np.sort(of_ring)).min() > 1.5 * 100 / 512
+    assert 0.45 * POINTS < len(shown.ring) < 0.55 * POINTS
+
+
+def test_a_page_is_full_but_not_beyond(shell: Shell, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert shell(f"convert {FIX} -o scans --quiet").code == 0
+    table = Path("scans/scans.csv").read_text(encoding="utf-8")
+    windows = read_windows(table, 1)
+    assert windows is not None
+    (one, *_) = read_clouds(Path("scans"), choose_places(windows, 1), windows)
+    for room in (3, 4, 5):
+        limit = int((room + 0.9) * one.chars)
+        monkeypatch.setattr("mlbatch.page.clouds._MOST_CHARS", limit)
+        clouds = chosen_clouds(Path("scans"), windows, None)
+        rows = [cloud.place.row for cloud in clouds]
+        assert rows == sorted(set(rows))
+        assert limit - 2 * one.chars < sum(cloud.chars for cloud in clouds) <= limit
 
 
 FAR = (
@@ -159,7 +256,7 @@ def test_an_mcap_file_alone_contains_its_report_and_table(shell: Shell) -> None:
     assert shell("report moved.mcap").out == "wrote moved.mcap.html\n"
     data = plot_data(Path("moved.mcap.html"))
     assert len(unpacked(data["windows"]["step"])) == 7
-    assert len(data["clouds"]) == 2
+    assert len(data["clouds"]) == 7
     page = Path("moved.mcap.html").read_text(encoding="utf-8")
     assert "The report has no command line" in page
 

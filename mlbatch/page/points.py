@@ -1,0 +1,218 @@
+"""The points of a scan as a page stores them: rounded, ordered by ring, differences deflated."""
+
+from __future__ import annotations
+
+import zlib
+from dataclasses import dataclass
+
+import numpy as np
+
+from mlbatch.arrays import BoolArray, F32Array, F64Array, I64Array, U8Array, U16Array
+from mlbatch.outputs.stored_scan import StoredScan
+from mlbatch.page.windows import Windows
+
+# Finest step of coordinates, below the noise of lidars.
+_STEP_M = 0.005
+_BYTE = 255
+_WORD = 65535
+# Shares of the points that the range of a colour covers: single bright points are no scale.
+_LOW, _HIGH = 0.02, 0.98
+# Share of the points of a lidar inside the first view.
+_IN_VIEW = 0.97
+
+
+@dataclass(frozen=True, slots=True)
+class Place:
+    """A window to show; title: what it is in the run, "" for most."""
+
+    title: str
+    row: int  # of the table
+    index: int
+    slice: int
+    start_ns: int
+
+
+@dataclass(frozen=True, slots=True)
+class PageCloud:
+    """A scan as the page stores it.
+
+    packed: deflated planes of its `shown` points, in this order: x, y, z in steps from the lowest,
+    time in 1/65535 of the window, ring, as differences in 16 bits (see `_differences`), then lidar
+    and intensity, in 8 bits.
+    """
+
+    place: Place
+    total: int  # points of the scan
+    stride: int  # every nth column is shown
+    shown: int
+    packed: bytes
+    low_m: tuple[float, float, float]
+    step_m: float
+    window_ms: float
+    height_m: tuple[float, float]  # range of the colours
+    centre_m: tuple[float, float, float]  # of the first view
+    view_m: float  # radius around the centre that contains most points of every lidar
+    has_lidar: bool
+    has_time: bool
+    has_intensity: bool
+    has_ring: bool
+
+    @property
+    def chars(self) -> int:
+        """Length of its base64."""
+        return -(-len(self.packed) // 3) * 4
+
+
+@dataclass(frozen=True, slots=True)
+class _Points:
+    """Valid points of one stored scan, (p, 3) and (p,); None for what it does not have."""
+
+    xyz: F32Array
+    lidar: U8Array | None
+    time_ns: I64Array | None
+    ring: I64Array | None
+    intensity: F64Array | None
+
+
+def page_cloud(
+    place: Place, scans: list[StoredScan], windows: Windows, stride: int = 1
+) -> PageCloud:
+    """Join the scans of a window; stride: keep every nth column of each lidar."""
+    parts = [_valid(scan) for scan in scans]
+    xyz: F64Array = np.concatenate([part.xyz for part in parts]).astype(np.float64)
+    total = len(xyz)
+    window_ns = int(windows.end_ns[place.row] - windows.start_ns[place.row])
+    lidars = [part.lidar for part in parts if part.lidar is not None]
+    times = [part.time_ns for part in parts if part.time_ns is not None]
+    rings = [part.ring for part in parts if part.ring is not None]
+    bright = [part.intensity for part in parts if part.intensity is not None]
+    has_lidar = len(lidars) == len(parts)
+    has_time = len(times) == len(parts)
+    has_ring = len(rings) == len(parts)
+    has_intensity = len(bright) == len(parts)
+    none = np.zeros(total, np.int64)
+    lidar: U8Array = np.concatenate(lidars) if has_lidar else none.astype(np.uint8)
+    time_ns: I64Array = np.concatenate(times) if has_time else none
+    ring: I64Array = np.concatenate(rings) if has_ring else none
+    intensity: F64Array = np.concatenate(bright) if has_intensity else none.astype(np.float64)
+    # Points without times are in the order of their columns.
+    share = time_ns / window_ns if has_time else np.arange(total) / max(1, total)
+    column = _columns(share, lidar, windows.expected[place.row])
+    order = np.lexsort((share, ring, lidar))
+    order = order[column[order] % stride == 0]
+    xyz = xyz[order]
+    low_m: F64Array = xyz.min(axis=0) if len(xyz) else np.zeros(3)
+    high_m: F64Array = xyz.max(axis=0) if len(xyz) else np.zeros(3)
+    step_m = max(float((high_m - low_m).max()) / _WORD, _STEP_M)
+    centre_m, view_m = _view(xyz, lidar[order])
+    return PageCloud(
+        place=place,
+        total=total,
+        stride=stride,
+        shown=len(xyz),
+        packed=_packed(
+            np.rint((xyz - low_m) / step_m).astype(np.uint16),
+            np.rint(np.clip(share[order] if has_time else 0 * share[order], 0, 1) * _WORD),
+            ring[order],
+            lidar[order],
+            _bytes_of(intensity[order]),
+        ),
+        low_m=(float(low_m[0]), float(low_m[1]), float(low_m[2])),
+        step_m=step_m,
+        window_ms=window_ns / 1e6,
+        height_m=_span(xyz[:, 2]),
+        centre_m=(float(centre_m[0]), float(centre_m[1]), float(centre_m[2])),
+        view_m=view_m,
+        has_lidar=has_lidar,
+        has_time=has_time,
+        has_intensity=has_intensity,
+        has_ring=has_ring,
+    )
+
+
+def _valid(scan: StoredScan) -> _Points:
+    finite: BoolArray = np.isfinite(scan.xyz)
+    valid = np.asarray(finite.all(axis=-1))
+    count = int(np.count_nonzero(valid))
+    lidar: U8Array | None = None
+    if scan.sensor is not None:
+        lidar = np.full(count, scan.sensor, dtype=np.uint8)
+    elif scan.lidar_id is not None:
+        # In an organized scan, of the columns.
+        ids = scan.lidar_id if scan.lidar_id.ndim == valid.ndim else scan.lidar_id[:, None]
+        lidar = np.broadcast_to(ids, valid.shape)[valid]
+    bright = scan.intensity if scan.intensity is not None else scan.byte_intensity
+    return _Points(
+        scan.xyz[valid],
+        lidar,
+        None if scan.time_ns is None else scan.time_ns[valid],
+        None if scan.ring is None else scan.ring[valid].astype(np.int64),
+        None if bright is None else bright[valid].astype(np.float64),
+    )
+
+
+def _columns(share: F64Array, lidar: U8Array, expected: I64Array) -> I64Array:
+    """Number of the column of each point in its window, (p,).
+
+    share: time in the window, 0 to 1; expected: columns of a whole window by lidar. A time, since
+    the firings of one column of some lidars have times of their own.
+    """
+    count: I64Array = np.maximum(1, expected[np.minimum(lidar, len(expected) - 1)])
+    return np.floor(share * count).astype(np.int64)
+
+
+def _packed(
+    xyz: U16Array, time: F64Array, ring: I64Array, lidar: U8Array, intensity: U8Array
+) -> bytes:
+    words = (*xyz.T, time, ring)
+    planes = [_differences(np.asarray(plane).astype(np.uint16)) for plane in words]
+    coder = zlib.compressobj(9, wbits=-15)
+    data = b"".join([*planes, lidar.tobytes(), intensity.tobytes()])
+    return coder.compress(data) + coder.flush()
+
+
+def _differences(words: U16Array) -> bytes:
+    """Differences of neighbours modulo 65536, small ones of either sign as small numbers.
+
+    0, -1, 1, -2 become 0, 1, 2, 3; first all low bytes, then all high ones.
+    """
+    steps = np.diff(words, prepend=np.uint16(0)).view(np.int16)
+    coded = ((steps << 1) ^ (steps >> 15)).view(np.uint16)
+    return (coded & _BYTE).astype(np.uint8).tobytes() + (coded >> 8).astype(np.uint8).tobytes()
+
+
+def _view(xyz: F64Array, lidar: U8Array) -> tuple[F64Array, float]:
+    """Centre (3,) and radius of a view, m, that has most points of every lidar.
+
+    The centre is the body; where the cloud is farther away than it is large, it is that of the
+    cloud.
+    """
+    parts = [xyz[lidar == number] for number in np.unique(lidar)]
+    if not parts:
+        return np.zeros(3), 1.0
+    boxes = np.array([[_span(part[:, axis]) for axis in range(3)] for part in parts])
+    low_m = boxes[:, :, 0].min(axis=0)
+    high_m = boxes[:, :, 1].max(axis=0)
+    centre_m: F64Array = (low_m + high_m) / 2
+    if np.linalg.norm(centre_m) <= np.linalg.norm(high_m - low_m):
+        centre_m = np.zeros(3)
+    away_m = [np.linalg.norm(part[:, :2] - centre_m[:2], axis=1) for part in parts]
+    return centre_m, max(1.0, *(_quantile(away, _IN_VIEW) for away in away_m))
+
+
+def _quantile(values: F64Array, share: float) -> float:
+    """A value of the array by nearest rank; 0 without one."""
+    if not len(values):
+        return 0.0
+    return float(np.sort(values)[int(share * (len(values) - 1))])
+
+
+def _span(values: F64Array) -> tuple[float, float]:
+    return _quantile(values, _LOW), _quantile(values, _HIGH)
+
+
+def _bytes_of(values: F64Array) -> U8Array:
+    """Values in 256 steps between the ends of their range of colours."""
+    low, high = _span(values)
+    width = high - low if high > low else 1.0
+    return np.rint(np.clip((values - low) / width, 0.0, 1.0) * _BYTE).astype(np.uint8)
