@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from mlbatch.api import calibrate as calibrate
     from mlbatch.api import convert as convert
     from mlbatch.api import inspect as inspect
     from mlbatch.api import open as open
@@ -13,16 +14,19 @@ if TYPE_CHECKING:
     from mlbatch.digests import digest as digest
     from mlbatch.errors import MlbatchError as MlbatchError
     from mlbatch.outputs.scan import Scan as Scan
+    from mlbatch.poses.calibration import Calibration as Calibration
     from mlbatch.python.recording import Recording as Recording
     from mlbatch.python.run import Run as Run
     from mlbatch.verification import verify as verify
 
 __version__ = "0.1.0"
 __all__ = [
+    "Calibration",
     "MlbatchError",
     "Recording",
     "Run",
     "Scan",
+    "calibrate",
     "convert",
     "digest",
     "inspect",
@@ -33,13 +37,14 @@ __all__ = [
 ]
 
 _PLACES = {
+    "Calibration": "mlbatch.poses.calibration",
     "MlbatchError": "mlbatch.errors",
     "Recording": "mlbatch.python.recording",
     "Run": "mlbatch.python.run",
     "Scan": "mlbatch.outputs.scan",
     "digest": "mlbatch.digests",
     "verify": "mlbatch.verification",
-    **dict.fromkeys(("convert", "inspect", "open", "read", "scans"), "mlbatch.api"),
+    **dict.fromkeys(("calibrate", "convert", "inspect", "open", "read", "scans"), "mlbatch.api"),
 }
 
 

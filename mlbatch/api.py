@@ -3,16 +3,27 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from datetime import date
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from mlbatch.errors import UsageError
 from mlbatch.outputs.read import read as read_output
 from mlbatch.outputs.scan import Scan
+from mlbatch.page import check_page, write_text_page
+from mlbatch.page.calibration import calibration_page
+from mlbatch.pipeline.conversion import Progress
 from mlbatch.pipeline.inspect import Inspection
 from mlbatch.pipeline.inspect import inspect as inspect_recordings
+from mlbatch.pipeline.job import Job
+from mlbatch.poses.calibration import Calibration
+from mlbatch.python.calibrate import calibrate as calibrate_rig
+from mlbatch.python.calibrate import calibrate_job, check_output, rig_text
 from mlbatch.python.options import (
     AnyPath,
     ConvertOptions,
+    Moment,
+    Names,
     Paths,
     ScanOptions,
     SessionOptions,
@@ -25,6 +36,7 @@ from mlbatch.python.options import (
 )
 from mlbatch.python.recording import Recording, scans_of
 from mlbatch.python.run import Run, run_job
+from mlbatch.writers import write_text
 
 if TYPE_CHECKING:
     # In `typing` from Python 3.11 on.
@@ -93,3 +105,60 @@ def inspect(recordings: Paths, metadata: Paths = (), *, whole: bool = False) -> 
     if not paths:
         raise UsageError("recording: expected at least one path, found none; name a recording")
     return inspect_recordings(paths, paths_of("metadata", metadata), whole=whole)
+
+
+def calibrate(
+    recordings: Paths,
+    rig: AnyPath,
+    output: AnyPath | None = None,
+    *,
+    metadata: Paths = (),
+    only: Names = (),
+    clock: str = "sensor",
+    start: Moment | None = None,
+    end: Moment | None = None,
+    time_offset: bool = False,
+    html: AnyPath | None = None,
+    overwrite: bool = False,
+) -> Calibration:
+    """Refine the poses of a rig's lidars, as `mlbatch calibrate` does; write rig and page if asked.
+
+    rig: with a guess of each pose, within 20 degrees and 1 m. Raises MlbatchError where the
+    recording does not determine the poses.
+    """
+    (guess,) = paths_of("rig", rig)
+    job = calibrate_job(
+        recordings, guess, metadata=metadata, only=only, clock=clock, start=start, end=end
+    )
+    return run_calibration(
+        job,
+        path_of("output", output),
+        path_of("html", html),
+        time_offset=time_offset,
+        overwrite=overwrite,
+    )
+
+
+def run_calibration(
+    job: Job,
+    output: Path | None,
+    html: Path | None,
+    *,
+    time_offset: bool,
+    overwrite: bool,
+    command: str = "mlbatch.calibrate",
+    progress: Progress | None = None,
+) -> Calibration:
+    """Calibrate the rig of a job; write the rig file and the page that are asked for."""
+    if output is not None:
+        check_output(output, overwrite=overwrite)
+    if html is not None:
+        check_page(html, overwrite=overwrite)
+    found = calibrate_rig(job, time_offset=time_offset, progress=progress)
+    if output is not None:
+        text = rig_text(job, found, output.parent, date.today())
+        write_text(output, text)
+    if html is not None:
+        names = ", ".join(path.name for path in job.recordings)
+        write_text_page(html, calibration_page(names, found, command))
+    return found

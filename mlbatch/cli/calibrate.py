@@ -1,0 +1,120 @@
+"""`mlbatch calibrate`: poses of the lidars of a rig, from a recording."""
+
+from __future__ import annotations
+
+import json
+import shlex
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from mlbatch.cli.parameters import one_of
+from mlbatch.errors import one_line
+from mlbatch.options import CLOCKS
+
+
+def calibrate(
+    recordings: Annotated[
+        list[Path],
+        typer.Argument(
+            help="Recordings of one session: pcap, pcapng, MCAP, ROS bags; folders of them; "
+            "patterns in quotes ('*.pcap')."
+        ),
+    ],
+    rig: Annotated[
+        Path,
+        typer.Option(
+            *("--rig", "-r"),
+            help="Rig file (YAML) with a guess of each pose, within 20 degrees and 1 m.",
+            metavar="FILE",
+        ),
+    ],
+    output: Annotated[
+        Path | None,
+        typer.Option("-o", "--output", help="Rig file to write.  [default: none]", metavar="FILE"),
+    ] = None,
+    metadata: Annotated[
+        list[Path] | None,
+        typer.Option(
+            *("--metadata", "-m"),
+            help="Metadata or calibration; repeatable.  [default: next to RECORDING]",
+            metavar="FILE",
+        ),
+    ] = None,
+    only: Annotated[
+        list[str] | None,
+        typer.Option(help="Only this sensor, by name or serial; repeatable.", metavar="SENSOR"),
+    ] = None,
+    clock: Annotated[
+        str,
+        one_of(
+            CLOCKS, "--clock", help="sensor: timestamps of the packets; host: their receive times."
+        ),
+    ] = "sensor",
+    start: Annotated[
+        str | None,
+        typer.Option(help="First time: ISO, epoch seconds, +S from the start.", metavar="TIME"),
+    ] = None,
+    end: Annotated[
+        str | None, typer.Option(help="Time to stop before, as --start.", metavar="TIME")
+    ] = None,
+    time_offset: Annotated[
+        bool,
+        typer.Option("--time-offset", help="Also find the delay of each lidar's timestamps."),
+    ] = False,
+    html: Annotated[
+        Path | None,
+        typer.Option(help="Also write a page (HTML): before and after.", metavar="FILE"),
+    ] = None,
+    overwrite: Annotated[
+        bool, typer.Option("--overwrite", help="Replace an existing rig file and page.")
+    ] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print JSON, for programs.")] = False,
+    verbose: Annotated[
+        bool,
+        typer.Option(
+            "--verbose", "-v", help="Print progress once a minute if stderr is no terminal."
+        ),
+    ] = False,
+) -> None:
+    """Refine the poses of a rig's lidars by the surfaces that they share."""
+    from mlbatch.api import run_calibration
+    from mlbatch.cli.progress import progress_bar
+    from mlbatch.cli.tables import paragraph, table_lines
+    from mlbatch.cli.values import long_name
+    from mlbatch.python.calibrate import calibrate_job
+
+    job = calibrate_job(
+        tuple(recordings),
+        rig,
+        metadata=tuple(metadata or ()),
+        only=tuple(only or ()),
+        clock=clock,
+        start=start,
+        end=end,
+        shown=long_name,
+    )
+    with progress_bar("calibrate", is_verbose=verbose) as progress:
+        found = run_calibration(
+            job,
+            output,
+            html,
+            time_offset=time_offset,
+            overwrite=overwrite,
+            command=shlex.join(["mlbatch", *sys.argv[1:]]),
+            progress=progress,
+        )
+    if as_json:
+        typer.echo(json.dumps(found.as_json(), indent=1))
+        return
+    typer.echo(paragraph(found.title()))
+    for line in table_lines(found.rows()):
+        typer.echo(line)
+    typer.echo("")
+    for line in table_lines(found.pair_rows()):
+        typer.echo(line)
+    for path in (output, html):
+        if path is not None:
+            typer.echo(one_line(f"wrote {path}"))

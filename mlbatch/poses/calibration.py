@@ -1,0 +1,566 @@
+"""Poses of the lidars of a rig, from places that several of them see; refused where they are not
+determined.
+
+Poses are solved on two thirds of the places. On the others they are measured: how far surfaces of
+two lidars are apart before and after, and which poses these places alone would give.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import combinations
+
+import numpy as np
+
+from mlbatch.arrays import F32Array, F64Array
+from mlbatch.errors import RecordingError
+from mlbatch.frames.transforms import from_rpy_deg, rpy_deg
+from mlbatch.motion.registration import Pose
+from mlbatch.motion.se3 import log_rotation, skew
+from mlbatch.poses.places import Places
+from mlbatch.poses.solve import Cloud, Place, Problem, Solution, State, find_poses, moved
+from mlbatch.poses.surfaces import distances, shared_cells
+from mlbatch.units import MM_PER_M, RAD_PER_DEG
+
+# How far a guess may be off; what is found beyond, with some reserve, is no refinement of it.
+MOST_OFF_M = 1.0
+MOST_OFF_DEG = 20.0
+_RESERVE = 1.5
+# Surfaces that two lidars must share.
+FEWEST_MATCHES = 60
+# Cells in which surfaces are compared, m; what agrees: least cosine of normals, most distance, m.
+_EDGE_M = 1.0
+_PARALLEL = 0.94
+_AGREES_M = 0.1
+# Share of the surfaces in common that agree, at least.
+_LEAST_AGREEING = 0.5
+# Places that were left out may give poses that differ by this, or by four standard deviations.
+_MOST_APART_M = 0.015
+_MOST_APART_DEG = 0.1
+# A turn of 1 rad counts as this far in `Solution.weak`, m.
+_LEVER_M = 10.0
+# A delay is known if its standard deviation is below, s.
+_MOST_DELAY_SIGMA_S = 0.002
+# Digits of poses that are written: micrometres, and degrees.
+_DIGITS = 6
+_MS_PER_S = 1000.0
+SCHEMA = "mlbatch.calibration/1"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LidarPose:
+    """The pose of a lidar.
+
+    body_from_sensor: (4, 4), m; sigma_mm: (3,), standard deviation of its origin along x, y, z of
+    the body; sigma_deg: (3,), of turns about them; moved_mm, turned_deg: from the guess;
+    delay_ms: to add to its timestamps, 0 unless asked for. The first lidar stays where it was.
+    """
+
+    name: str
+    body_from_sensor: F64Array
+    sigma_mm: F64Array
+    sigma_deg: F64Array
+    moved_mm: float
+    turned_deg: float
+    delay_ms: float
+    delay_sigma_ms: float
+    is_fixed: bool
+
+
+@dataclass(frozen=True, slots=True)
+class Agreement:
+    """Surfaces of two lidars on the places that were left out.
+
+    matched: pieces of surfaces that both see and that agree; share: of those in the cells that
+    both see; apart_mm: median of their distances, NaN without any.
+    """
+
+    matched: int
+    share: float
+    apart_mm: float
+
+
+@dataclass(frozen=True, slots=True)
+class LidarPair:
+    """Two lidars: their surfaces with the guess and with the poses that were found."""
+
+    first: str
+    second: str
+    before: Agreement
+    after: Agreement
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class View:
+    """One place that was left out: points (n, 3) of each lidar, m, body frame."""
+
+    before: tuple[F32Array, ...]
+    after: tuple[F32Array, ...]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Calibration:
+    """Poses of all lidars, and how well they fit.
+
+    places: number that the poses were solved on; held_out: number that they were measured on;
+    different: with a view of their own; windows: of the recording; view: a picture.
+    """
+
+    lidars: tuple[LidarPose, ...]
+    pairs: tuple[LidarPair, ...]
+    places: int
+    held_out: int
+    different: int
+    windows: int
+    view: View
+
+    def title(self) -> str:
+        """What the poses come from, in a line."""
+        return (
+            f"{self.places} places, measured on {self.held_out} others, of {self.windows} windows; "
+            f"{self.lidars[0].name} stays where it is; standard deviations along and about x, y, "
+            "z of the body"
+        )
+
+    def rows(self) -> list[list[str]]:
+        """The table of lidars; row 0 is the head."""
+        has_delay = any(lidar.delay_sigma_ms for lidar in self.lidars)
+        head = ["lidar", "x, y, z m", "roll, pitch, yaw deg", "moved mm", "turned deg"]
+        head += ["+- mm", "+- deg", *(["delay ms"] if has_delay else [])]
+        return [head, *(_row(lidar, has_delay=has_delay) for lidar in self.lidars)]
+
+    def pair_rows(self) -> list[list[str]]:
+        """The table of pairs of lidars; row 0 is the head."""
+        head = ["pair", "surfaces", "agree before", "agree after", "apart before mm"]
+        rows = [
+            [
+                f"{pair.first}, {pair.second}",
+                str(pair.after.matched),
+                f"{100 * pair.before.share:.0f} %",
+                f"{100 * pair.after.share:.0f} %",
+                f"{pair.before.apart_mm:.1f}",
+                f"{pair.after.apart_mm:.1f}",
+            ]
+            for pair in self.pairs
+        ]
+        return [[*head, "apart after mm"], *rows]
+
+    def as_json(self) -> dict[str, object]:
+        """The document of `--json`."""
+        return {
+            "schema": SCHEMA,
+            "places": self.places,
+            "held_out": self.held_out,
+            "different": self.different,
+            "windows": self.windows,
+            "lidars": [
+                {
+                    "name": lidar.name,
+                    "body_from_sensor": lidar.body_from_sensor.tolist(),
+                    "is_fixed": lidar.is_fixed,
+                    "sigma_mm": lidar.sigma_mm.tolist(),
+                    "sigma_deg": lidar.sigma_deg.tolist(),
+                    "moved_mm": lidar.moved_mm,
+                    "turned_deg": lidar.turned_deg,
+                    "delay_ms": lidar.delay_ms,
+                    "delay_sigma_ms": lidar.delay_sigma_ms,
+                }
+                for lidar in self.lidars
+            ],
+            "pairs": [
+                {
+                    "first": pair.first,
+                    "second": pair.second,
+                    "before": _agreement_as_json(pair.before),
+                    "after": _agreement_as_json(pair.after),
+                }
+                for pair in self.pairs
+            ],
+        }
+
+
+def _row(lidar: LidarPose, *, has_delay: bool) -> list[str]:
+    origin, angles = lidar.body_from_sensor[:3, 3].tolist(), rpy_deg(lidar.body_from_sensor)
+    cells = [lidar.name, numbers(origin, 4), numbers(angles, 3)]
+    if lidar.is_fixed:
+        return [*cells, "-", "-", "-", "-", *(["-"] if has_delay else [])]
+    cells += [f"{lidar.moved_mm:.1f}", f"{lidar.turned_deg:.3f}"]
+    cells += [numbers(lidar.sigma_mm.tolist(), 1), numbers(lidar.sigma_deg.tolist(), 3)]
+    return [*cells, *([f"{lidar.delay_ms:.2f} +- {lidar.delay_sigma_ms:.2f}"] if has_delay else [])]
+
+
+def numbers(values: Sequence[float], digits: int) -> str:
+    """Numbers with as many decimals, by commas; no -0."""
+    return ", ".join(f"{round(value, digits) + 0.0:.{digits}f}" for value in values)
+
+
+def _agreement_as_json(found: Agreement) -> dict[str, object]:
+    # JSON has no NaN.
+    apart_mm = found.apart_mm if np.isfinite(found.apart_mm) else None
+    return {"matched": found.matched, "share": found.share, "apart_mm": apart_mm}
+
+
+def calibrated(
+    places: Places,
+    names: Sequence[str],
+    poses: Sequence[F64Array],
+    *,
+    delays: bool = False,
+    guess: State | None = None,
+) -> Calibration:
+    """Refine poses (4, 4) body_from_sensor that the clouds of places were converted with.
+
+    delays: also solve for the delay of each lidar; guess: corrections to begin with, else none.
+    Raises RecordingError with the reason where the recording does not determine them.
+    """
+    fitted, held_out = places.fitted(), places.held_out()
+    _refuse_few(places, names)
+    # Twists of the guess, if any, are those of no place.
+    begin = None if guess is None else _start(guess, len(fitted))
+    found = find_poses(fitted, len(names), delays=delays, guess=begin)
+    _refuse_unseen(found, names)
+    _refuse_undetermined(found, names, delays=delays)
+    lidars = _lidar_poses(found, names, poses, 1.0, delays=delays)
+    _refuse_far(lidars)
+    again = find_poses(held_out, len(names), guess=_start(found.state, len(held_out)))
+    twists = again.state.twists
+    start = State.start(len(names), len(held_out))
+    before = _agreements(held_out, _with_twists(start, twists))
+    after = _agreements(held_out, _with_twists(found.state, twists))
+    pairs = tuple(
+        LidarPair(names[a], names[b], before[a, b], after[a, b])
+        for a, b in combinations(range(len(names)), 2)
+        if before[a, b].matched or after[a, b].matched
+    )
+    _refuse_disagreement(pairs)
+    _refuse_apart(found, again, names, poses)
+    # Places with one view are not independent.
+    doubt = max(1.0, len(places.kept) / max(1, places.different))
+    doubt = max(doubt, _disagreement(found, again, poses))
+    return Calibration(
+        _lidar_poses(found, names, poses, doubt, delays=delays),
+        pairs,
+        len(fitted),
+        len(held_out),
+        places.different,
+        places.windows,
+        _view(held_out, start, found.state, twists),
+    )
+
+
+def _start(state: State, places: int) -> State:
+    """The poses of a state for other places."""
+    return State(list(state.corrections), np.zeros((places, 6)), state.delay_s.copy())
+
+
+def _with_twists(state: State, twists: F64Array) -> State:
+    """A state with the motion of other places (places, 6)."""
+    return State(state.corrections, twists, state.delay_s)
+
+
+# -- figures --------------------------------------------------------------------------------------
+
+
+def _lidar_poses(
+    found: Solution, names: Sequence[str], poses: Sequence[F64Array], doubt: float, *, delays: bool
+) -> tuple[LidarPose, ...]:
+    """Poses with standard deviations; doubt: factor of their variances."""
+    each = 7 if delays else 6
+    lidars = []
+    for number, (name, old) in enumerate(zip(names, poses, strict=True)):
+        if not number:
+            still = np.zeros(3)
+            lidars.append(LidarPose(name, old, still, still, 0.0, 0.0, 0.0, 0.0, is_fixed=True))
+            continue
+        new = _corrected(old, found.state.corrections[number])
+        at = each * (number - 1)
+        covariance = doubt * found.covariance[at : at + each, at : at + each]
+        shift, turn = _spread_at(covariance, old[:3, 3])
+        moved_m, turned_rad = _between(old, new)
+        lidars.append(
+            LidarPose(
+                name,
+                new,
+                MM_PER_M * shift,
+                turn / RAD_PER_DEG,
+                MM_PER_M * moved_m,
+                turned_rad / RAD_PER_DEG,
+                _MS_PER_S * float(found.state.delay_s[number]),
+                _MS_PER_S * float(np.sqrt(covariance[6, 6])) if delays else 0.0,
+                is_fixed=False,
+            )
+        )
+    return tuple(lidars)
+
+
+def _corrected(pose: F64Array, correction: Pose) -> F64Array:
+    """A pose (4, 4) after a correction, rounded to the digits that are written."""
+    moved = np.eye(4)
+    moved[:3, :3] = np.matmul(correction.rotation, pose[:3, :3])
+    moved[:3, 3] = np.matmul(correction.rotation, pose[:3, 3]) + correction.position_m
+    origin = [round(value, _DIGITS) + 0.0 for value in moved[:3, 3].tolist()]
+    angles = [round(value, _DIGITS) + 0.0 for value in rpy_deg(moved)]
+    return from_rpy_deg(origin, angles)
+
+
+def _between(one: F64Array, other: F64Array) -> tuple[float, float]:
+    """Distance of the origins of two poses (4, 4), m, and the angle between them, rad."""
+    turn = log_rotation(np.matmul(other[:3, :3], one[:3, :3].T)[None])[0]
+    return float(np.linalg.norm(other[:3, 3] - one[:3, 3])), float(np.linalg.norm(turn))
+
+
+def _at(position_m: F64Array) -> F64Array:
+    """Matrix (6, 6) from a shift at the body origin and a turn to those at a position (3,)."""
+    found = np.eye(6)
+    found[:3, 3:] = -skew(position_m[None])[0]
+    return found
+
+
+def _spread_at(covariance: F64Array, position_m: F64Array) -> tuple[F64Array, F64Array]:
+    """Standard deviations of a shift at a position, m, and of a turn, rad; of (6 or 7, ...)."""
+    there = _at(position_m)
+    moved = np.matmul(np.matmul(there, covariance[:6, :6]), there.T)
+    deviation = np.sqrt(np.maximum(np.diag(moved), 0.0))
+    return deviation[:3], deviation[3:]
+
+
+def _agreements(places: Sequence[Place], state: State) -> dict[tuple[int, int], Agreement]:
+    """How surfaces of each pair of lidars agree in places."""
+    lidars = len(state.corrections)
+    problem = Problem(places, lidars)
+    shared = dict.fromkeys(combinations(range(lidars), 2), 0)
+    apart_m: dict[tuple[int, int], list[F64Array]] = {pair: [] for pair in shared}
+    for number, place in enumerate(places):
+        surfaces = problem.clouds(number, state, _EDGE_M)
+        for first, second in combinations(range(len(place)), 2):
+            a, b = sorted((place[first].lidar, place[second].lidar))
+            if a == b:
+                continue
+            shared[a, b] += len(shared_cells(surfaces[first], surfaces[second])[0])
+            found = distances(surfaces[first], surfaces[second], _PARALLEL, MOST_OFF_M)
+            apart_m[a, b].append(np.abs(found.distance_m))
+    return {pair: _agreement(shared[pair], np.concatenate(apart_m[pair])) for pair in shared}
+
+
+def _agreement(shared: int, apart_m: F64Array) -> Agreement:
+    matched = int((apart_m <= _AGREES_M).sum())
+    middle_m = float(np.median(apart_m)) if len(apart_m) else float("nan")
+    return Agreement(matched, matched / max(1, shared), MM_PER_M * middle_m)
+
+
+def _differences(
+    found: Solution, again: Solution, poses: Sequence[F64Array]
+) -> list[tuple[F64Array, F64Array]]:
+    """How far two solutions place each lidar but the first apart, and its covariance.
+
+    (6,): shift at the lidar, m, turn, rad; what `again` does not determine is left out.
+    """
+    differences = []
+    units = np.array([1.0] * 3 + [1.0 / _LEVER_M] * 3)
+    size = len(found.covariance) // (len(poses) - 1)
+    for number in range(1, len(poses)):
+        one, other = found.state.corrections[number], again.state.corrections[number]
+        turn = np.matmul(other.rotation, one.rotation.T)
+        off = np.concatenate(
+            [other.position_m - np.matmul(turn, one.position_m), log_rotation(turn[None])[0]]
+        )
+        at, at_again = size * (number - 1), 6 * (number - 1)
+        for axis in again.weak[at_again : at_again + 6].T:
+            off = off - units * axis * float(axis @ (off / units))
+        covariance = (
+            found.covariance[at : at + 6, at : at + 6]
+            + again.covariance[at_again : at_again + 6, at_again : at_again + 6]
+        )
+        there = _at(poses[number][:3, 3])
+        differences.append(
+            (np.matmul(there, off), np.matmul(np.matmul(there, covariance), there.T))
+        )
+    return differences
+
+
+def _disagreement(found: Solution, again: Solution, poses: Sequence[F64Array]) -> float:
+    """Mean squared difference of two solutions in variances, of the worst lidar."""
+    worst = 0.0
+    for off, covariance in _differences(found, again, poses):
+        worst = max(worst, float(off @ np.linalg.solve(covariance, off)) / len(off))
+    return worst
+
+
+# -- refusals -------------------------------------------------------------------------------------
+
+
+def _refused(expected: str, found: str, remedy: str) -> RecordingError:
+    return RecordingError(f"calibrate: expected {expected}, found {found}; {remedy}")
+
+
+def _refuse_few(places: Places, names: Sequence[str]) -> None:
+    if places.fitted() and places.held_out():
+        return
+    lacking = ", ".join(
+        f"{name} is missing from {count}"
+        for name, count in zip(names, places.lacking, strict=True)
+        if count
+    )
+    raise _refused(
+        "two places or more, each two windows that follow each other with points of every lidar",
+        f"{len(places.kept)} in {places.windows} windows{f' ({lacking})' if lacking else ''}",
+        "record for longer, or leave out the lidar that sent nothing (--only)",
+    )
+
+
+def _refuse_unseen(found: Solution, names: Sequence[str]) -> None:
+    """Refuse lidars that no chain of common surfaces joins with the first one."""
+    joined = {0}
+    for _ in names:
+        for (a, b), count in found.matched.items():
+            if count >= FEWEST_MATCHES and (a in joined or b in joined):
+                joined |= {a, b}
+    for number, name in enumerate(names):
+        if number not in joined:
+            raise _refused(
+                f"surfaces that {name} and {names[0]} both see",
+                "none, or too few, that fit together",
+                f"correct the guess if it is more than {MOST_OFF_DEG:g} degrees or {MOST_OFF_M:g} "
+                "m off; lidars whose views never meet need --from-motion, and a recording in which "
+                "the machine drives and turns",
+            )
+
+
+def _refuse_undetermined(found: Solution, names: Sequence[str], *, delays: bool) -> None:
+    each = 7 if delays else 6
+    directions = dict.fromkeys(_direction(axis, names, each) for axis in found.weak.T)
+    if delays:
+        sigma_s = np.sqrt(np.diag(found.covariance))[6::7]
+        for name, sigma in zip(names[1:], sigma_s.tolist(), strict=True):
+            if sigma > _MOST_DELAY_SIGMA_S:
+                directions[f"{name}: its delay"] = None
+    if not directions:
+        return
+    raise _refused(
+        "surfaces that fix the poses in every direction",
+        f"none that fix {'; '.join(directions)}",
+        _record_instead(list(directions)),
+    )
+
+
+def _direction(axis: F64Array, names: Sequence[str], each: int) -> str:
+    """What a direction of the poses (u,) moves, in words."""
+    parts = axis.reshape(-1, each)
+    lidar = int(np.argmax((parts**2).sum(axis=1)))
+    shift, turn = parts[lidar, :3], parts[lidar, 3:6]
+    name = names[lidar + 1]
+    rigid = float((parts[lidar, :6] ** 2).sum())
+    if each == 7 and parts[lidar, 6] ** 2 > rigid:
+        return f"{name}: its delay"
+    if float(shift @ shift) >= float(turn @ turn):
+        return f"{name}: a shift along {_axis(shift)} of the body"
+    return f"{name}: a turn about {_axis(turn)} of the body"
+
+
+def _axis(vector: F64Array) -> str:
+    """x, y or z, or the direction in numbers."""
+    unit = vector / np.linalg.norm(vector)
+    largest = int(np.argmax(np.abs(unit)))
+    if abs(unit[largest]) > 0.9:
+        return "xyz"[largest]
+    return f"({', '.join(f'{value:.2f}' for value in (unit * np.sign(unit[largest])).tolist())})"
+
+
+def _record_instead(directions: Sequence[str]) -> str:
+    """What to record so that directions are fixed."""
+    wanted = {
+        "a shift along z": "a floor that both see",
+        "a shift": "a corner, a wall across, a stop at a junction",
+        "a turn about z": "walls or trunks some metres away",
+        "a turn": "a floor and walls some metres away",
+        "its delay": "turns of the machine while it is near walls",
+    }
+    found = dict.fromkeys(
+        next(what for key, what in wanted.items() if f": {key}" in direction)
+        for direction in directions
+    )
+    return f"also record {', and '.join(found)}, seen by both lidars at the same time"
+
+
+def _refuse_far(lidars: Sequence[LidarPose]) -> None:
+    for lidar in lidars:
+        if (
+            lidar.moved_mm > _RESERVE * MM_PER_M * MOST_OFF_M
+            or lidar.turned_deg > _RESERVE * MOST_OFF_DEG
+        ):
+            raise _refused(
+                f"a guess of {lidar.name} within {MOST_OFF_DEG:g} degrees and {MOST_OFF_M:g} m",
+                f"poses that fit {lidar.turned_deg:.0f} degrees and {lidar.moved_mm / 1000:.1f} m "
+                "away, which may be another wall",
+                "correct the guess, or give --from-motion",
+            )
+
+
+def _refuse_disagreement(pairs: Sequence[LidarPair]) -> None:
+    """Refuse poses that do not fit on the places that were left out."""
+    for pair in pairs:
+        before, after = pair.before, pair.after
+        who = f"{pair.first} and {pair.second}"
+        if after.matched >= FEWEST_MATCHES and after.share < _LEAST_AGREEING:
+            raise _refused(
+                f"surfaces of {who} that agree on places that were left out",
+                f"{100 * after.share:.0f} % of them",
+                "correct the guess, or record where less moves",
+            )
+        if after.share < before.share - 0.02 or (
+            after.matched <= before.matched and after.apart_mm > 1.1 * before.apart_mm + 1.0
+        ):
+            raise _refused(
+                f"poses that fit {who} better than the guess on places that were left out",
+                f"surfaces {after.apart_mm:.1f} mm apart, before {before.apart_mm:.1f} mm",
+                "record other places, or keep the guess",
+            )
+
+
+def _refuse_apart(
+    found: Solution, again: Solution, names: Sequence[str], poses: Sequence[F64Array]
+) -> None:
+    """Refuse poses that the places that were left out contradict."""
+    for name, (off, covariance) in zip(names[1:], _differences(found, again, poses), strict=True):
+        bound = 4.0 * np.sqrt(np.diag(covariance))
+        bound[:3] += _MOST_APART_M
+        bound[3:] += _MOST_APART_DEG * RAD_PER_DEG
+        if (np.abs(off) > bound).any():
+            shift_mm = MM_PER_M * float(np.linalg.norm(off[:3]))
+            turn_deg = float(np.linalg.norm(off[3:])) / RAD_PER_DEG
+            raise _refused(
+                f"one pose of {name} from all places",
+                f"two that are {shift_mm:.0f} mm and {turn_deg:.2f} degrees apart",
+                "record more places, where less moves",
+            )
+
+
+# -- picture --------------------------------------------------------------------------------------
+
+
+def _view(places: Sequence[Place], start: State, found: State, twists: F64Array) -> View:
+    """The clouds of the place in the middle of some, moved to one instant."""
+    number = len(places) // 2
+    lidars = range(len(found.corrections))
+
+    def points(state: State) -> tuple[F32Array, ...]:
+        return tuple(
+            np.concatenate(
+                [
+                    _placed(cloud, state, twists[number])
+                    for cloud in places[number]
+                    if cloud.lidar == lidar
+                ]
+            )
+            for lidar in lidars
+        )
+
+    return View(points(start), points(found))
+
+
+def _placed(cloud: Cloud, state: State, twist: F64Array) -> F32Array:
+    pose = state.corrections[cloud.lidar]
+    points_m = np.matmul(cloud.points_m, pose.rotation.T) + pose.position_m
+    time_s = cloud.time_s + state.delay_s[cloud.lidar]
+    return moved(points_m, time_s, twist).astype(np.float32)

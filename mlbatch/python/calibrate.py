@@ -1,0 +1,130 @@
+"""Calibration of a rig: the guess, the recording, the refined rig file."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable, Generator
+from dataclasses import replace
+from datetime import date
+from pathlib import Path
+
+from mlbatch.errors import ExportError, UsageError
+from mlbatch.pipeline.conversion import Conversion, Progress
+from mlbatch.pipeline.job import Job
+from mlbatch.poses.calibration import Calibration, LidarPose, calibrated, numbers
+from mlbatch.poses.places import LEAST_RANGE_M, MOST_RANGE_M, places_of
+from mlbatch.python.options import Moment, Names, Paths, session_job, window_job
+from mlbatch.rig.rig import Rig, RigSensor, read_rig
+from mlbatch.rig.write import write_rig
+from mlbatch.types import Scan
+from mlbatch.units import NS_PER_MS
+from mlbatch.writers import check_name
+
+# Windows in which a machine moves evenly, Hz.
+_RATE = 10
+
+
+def calibrate_job(
+    recordings: Paths | tuple[Paths, ...],
+    rig: Path,
+    *,
+    metadata: Paths = (),
+    clock: str = "sensor",
+    only: Names = (),
+    start: Moment | None = None,
+    end: Moment | None = None,
+    shown: Callable[[str], str] = str,
+) -> Job:
+    """The job whose scans a calibration reads; shown: the name of an option in errors."""
+    session = session_job(
+        recordings, {"rig": rig, "metadata": metadata, "clock": clock, "only": only}, shown
+    )
+    job = window_job(session, {"rate": _RATE, "start": start, "end": end}, shown)
+    return replace(job, min_range_m=LEAST_RANGE_M, max_range_m=MOST_RANGE_M)
+
+
+def calibrate(
+    job: Job, *, time_offset: bool = False, progress: Progress | None = None
+) -> Calibration:
+    """Refine the poses of the rig of a job; MlbatchError where they are not determined."""
+    run = Conversion(job)
+    names = [sensor.name for sensor in run.sensors]
+    if len(names) < 2:
+        raise UsageError(
+            f"calibrate: expected two lidars or more, found {names[0]} alone; give the recordings "
+            "of all, and a rig with all of them"
+        )
+    poses = [sensor.pose.body_from_sensor for sensor in run.session.setup.sensors]
+    with contextlib.closing(_scans(run, progress)) as scans:
+        places = places_of(scans, len(names))
+    return calibrated(places, names, poses, delays=time_offset)
+
+
+def _scans(run: Conversion, progress: Progress | None) -> Generator[Scan, None, None]:
+    for scan, _ in run.scans(progress):
+        yield scan
+
+
+def rig_text(job: Job, found: Calibration, folder: Path, on: date) -> str:
+    """The rig of a job with refined poses, for a file in a folder; on: the day in its comments.
+
+    All other keys are those of the guess.
+    """
+    guess = _rig_path(job)
+    rig = read_rig(guess)
+    lidars = {lidar.name: lidar for lidar in found.lidars}
+    sensors = [
+        _refined(sensor, lidars[sensor.name], job) if sensor.name in lidars else sensor
+        for sensor in rig.sensors
+    ]
+    source = ", ".join(path.name for path in job.recordings)
+    notes = {
+        lidar.name: f"extrinsics as in {guess.name}; the others are relative to it"
+        if lidar.is_fixed
+        else f"extrinsics by mlbatch calibrate, {on.isoformat()}, from {source}; standard "
+        f"deviations {_deviations(lidar)} (x, y, z of the body)"
+        for lidar in found.lidars
+    }
+    refined: Rig = replace(rig, sensors=tuple(sensors))
+    return write_rig(refined, folder, notes)
+
+
+def _rig_path(job: Job) -> Path:
+    if job.selection.rig is None:
+        raise UsageError(
+            "--rig: expected a rig file with a guess of each pose, found none; write one with "
+            "`mlbatch inspect RECORDING --write-rig rig.yaml` and fill it in"
+        )
+    return job.selection.rig
+
+
+def _refined(sensor: RigSensor, lidar: LidarPose, job: Job) -> RigSensor:
+    """A sensor of the rig with what was found."""
+    if lidar.is_fixed:
+        return sensor
+    delay_ns = round(lidar.delay_ms * NS_PER_MS)
+    clock = "host" if delay_ns and job.selection.host_clock else sensor.clock
+    return replace(
+        sensor,
+        extrinsics=lidar.body_from_sensor,
+        extrinsics_files=(),
+        offset_ns=sensor.offset_ns + delay_ns,
+        clock=clock,
+    )
+
+
+def _deviations(lidar: LidarPose) -> str:
+    sigma_mm, sigma_deg = lidar.sigma_mm.tolist(), lidar.sigma_deg.tolist()
+    return f"{numbers(sigma_mm, 1)} mm, {numbers(sigma_deg, 3)} degrees"
+
+
+def check_output(path: Path, *, overwrite: bool) -> None:
+    """Raise ExportError if a rig file cannot be written to a path."""
+    check_name(path)
+    if path.is_dir():
+        raise ExportError(f"{path}: expected a file for the rig, found a folder; add a name")
+    if path.exists() and not overwrite:
+        raise ExportError(
+            f"{path}: expected a new rig file, found an existing one; choose another name or "
+            "--overwrite"
+        )
