@@ -542,7 +542,10 @@ def _refuse_unknown_in_rig(unknown: Mapping[str, str], poses: Mapping[str, Pose]
     """Raise RigError for `extrinsics: unknown`; unknown: place in the rig file, by sensor."""
     (name, place), *others = unknown.items()
     also = f" (also of {', '.join(other for other, _ in others)})" if others else ""
-    remedy = "measure it and give translation_m and a rotation"
+    remedy = (
+        "give translation_m and a rotation (a guess is enough for `mlbatch calibrate`, which "
+        "refines it)"
+    )
     if poses[name].is_known:
         remedy = f"remove the key to use that of {poses[name].describe()}"
     raise RigError(

@@ -71,8 +71,9 @@ HEAD = (
     "missing",
 )
 _MEASURE = (
-    "extrinsics not known: measure them and replace `unknown` by "
-    "{translation_m: [x, y, z], rotation_rpy_deg: [r, p, y]}"
+    "extrinsics not known: replace `unknown` by {translation_m: [x, y, z], "
+    "rotation_rpy_deg: [r, p, y]}; a guess within 1 m and 20 degrees is refined by mlbatch "
+    "calibrate"
 )
 # Warnings that concern a conversion; the table shows missing metadata and decoders.
 _CONVERSION_ONLY = frozenset({"no_decoder", "no_metadata", "not_seen_yet", "identity_extrinsics"})

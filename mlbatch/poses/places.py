@@ -20,7 +20,7 @@ from mlbatch.units import NS_PER_S
 # Windows of a place: their surfaces, compared with each other, give the motion.
 WINDOWS = 2
 # Places that are kept at the end are half as many or more.
-MOST_PLACES = 16
+MOST_PLACES = 20
 # Of a machine at rest.
 _MOST_AT_REST = 3
 # Columns of a window are thinned to about this many points of a lidar.
@@ -142,6 +142,7 @@ def places_of(scans: Iterable[Scan], lidars: int) -> Places:
 
 def _clouds(scan: Scan, lidars: int, instant_ns: int) -> Iterator[Cloud]:
     """The points of each lidar in a scan, thinned by whole columns; times from an instant."""
+    sensors = scan.info.sensors
     time_s = (scan.time_ns.astype(np.int64) + (scan.start_ns - instant_ns)) / NS_PER_S
     for lidar in range(lidars):
         rows = np.flatnonzero(scan.lidar_id == lidar)
@@ -150,7 +151,8 @@ def _clouds(scan: Scan, lidars: int, instant_ns: int) -> Iterator[Cloud]:
             # Columns of this lidar up to each column.
             ordinal = np.cumsum(scan.column_lidar_id == lidar)
             rows = rows[ordinal[scan.column[rows]] % step == 0]
-        yield Cloud(lidar, scan.xyz[rows].astype(np.float64), time_s[rows])
+        origin_m = sensors[lidar].body_from_sensor[:3, 3]
+        yield Cloud(lidar, scan.xyz[rows].astype(np.float64), time_s[rows], origin_m)
 
 
 def _view(xyz_m: F32Array) -> F64Array:

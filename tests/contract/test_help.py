@@ -39,6 +39,9 @@ OPTIONS: dict[str, set[str]] = {
         "report": "output report html-scans overwrite",
         "simulate": "output duration seed overwrite quiet",
         "schema": "",
+        "calibrate": """
+            rig output metadata only clock start end time-offset html overwrite json verbose
+        """,
         "digest": "output against overwrite",
         "diff": "tolerance json",
     }.items()

@@ -461,6 +461,10 @@ def test_angles_that_are_round_in_radians(shell: Shell, tmp_path: Path, given_: 
 
 
 PLACE = UnknownExtrinsics("rig.yaml:7: sensors[1].extrinsics")
+GIVE = (
+    "give translation_m and a rotation (a guess is enough for `mlbatch calibrate`, which refines "
+    "it)"
+)
 
 
 def test_unknown_in_the_rig_is_refused_with_its_place() -> None:
@@ -470,7 +474,7 @@ def test_unknown_in_the_rig_is_refused_with_its_place() -> None:
         "when there are two or more, found unknown; "
     )
     end = ", or accept the body origin with --identity-extrinsics"
-    assert one.refusal() == f"{start}measure it and give translation_m and a rotation{end}"
+    assert one.refusal() == f"{start}{GIVE}{end}"
     # Although another source knows it: the rig is the first source.
     other = replace(one, static=SIDES, body="base_link")
     found = "tf_static: base_link -> right/os_sensor"

@@ -173,8 +173,9 @@ def test_extrinsics_nobody_gave_are_written_as_unknown_and_refused(shell: Shell)
     places = [number for number, line in enumerate(lines, 1) if line == "    extrinsics: unknown"]
     assert len(places) == 2
     comment = (
-        "  # extrinsics not known: measure them and replace `unknown` by "
-        "{translation_m: [x, y, z], rotation_rpy_deg: [r, p, y]}"
+        "  # extrinsics not known: replace `unknown` by {translation_m: [x, y, z], "
+        "rotation_rpy_deg: [r, p, y]}; a guess within 1 m and 20 degrees is refined by mlbatch "
+        "calibrate"
     )
     assert lines.count(comment) == 2
     refused = shell(f"convert {CAPTURE} --rig rig.yaml -o out")
@@ -182,7 +183,8 @@ def test_extrinsics_nobody_gave_are_written_as_unknown_and_refused(shell: Shell)
     assert refused.err == (
         f"mlbatch: error: rig.yaml:{places[0]}: sensors[0].extrinsics: expected the pose of "
         f"{LEFT}, required for every sensor when there are two or more, found unknown (also of "
-        f"{RIGHT}); measure it and give translation_m and a rotation, or accept the body origin "
+        f"{RIGHT}); give translation_m and a rotation (a guess is enough for `mlbatch calibrate`, "
+        "which refines it), or accept the body origin "
         "with --identity-extrinsics\n"
     )
     assert not Path("out").exists()

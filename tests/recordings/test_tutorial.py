@@ -31,7 +31,7 @@ def test_each_error_names_the_next_step(tmp_path: Path) -> None:
     convert = ("convert", drive, "--rig", rig, "-o", scans)
 
     assert "use --align-clocks or --clock host" in command(*convert).err
-    assert "measure it and give translation_m" in command(*convert, "--clock", "host").err
+    assert "give translation_m and a rotation" in command(*convert, "--clock", "host").err
     text = rig.read_text(encoding="utf-8")
     assert text.count(UNKNOWN) == len(POSES)
     for pose in POSES:
