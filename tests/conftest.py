@@ -59,6 +59,7 @@ LONG = (
     "page/test_comparison.py::test_it_is_drawn_in_a_browser",
     "page/test_windows.py::test_long_runs",
     "pipeline/test_resume.py",
+    "poses/test_calibration.py",
     "readers/test_buffer_ends.py",
     "rig/test_extrinsics_files.py::test_any_text",
     "sensors/test_vendors.py",

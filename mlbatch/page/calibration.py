@@ -82,10 +82,10 @@ def _cuts(clouds: Clouds) -> list[_Cut]:
     height_m = _middle(mean_m[:, 2], upright)
     across_m = _middle(mean_m[:, 1], normal[:, 1] < _UPRIGHT)
     above = np.array([0.0, 0.0, height_m])
-    beside = np.array([0.0, across_m, 0.0])
+    aside = np.array([0.0, across_m, 0.0])
     cuts = [
         _Cut(f"From above, {height_m:.1f} m high", (0, 1, 2), above, _half_m(clouds, above, 2)),
-        _Cut(f"From the side, y {across_m:.1f} m", (0, 2, 1), beside, _half_m(clouds, beside, 1)),
+        _Cut(f"From the side, y {across_m:.1f} m", (0, 2, 1), aside, _half_m(clouds, aside, 1)),
     ]
     near = upright & (np.abs(mean_m[:, 2] - height_m) < _EDGE_M)
     if near.any():

@@ -33,8 +33,8 @@ FEWEST_MATCHES = 60
 _EDGE_M = 1.0
 _PARALLEL = 0.94
 _AGREES_M = 0.1
-# Share of the surfaces in common that agree, at least.
-_LEAST_AGREEING = 0.5
+# Share of the surfaces in common that agree, at least: a floor agrees at a wrong yaw, too.
+_LEAST_AGREEING = 0.8
 # Places that were left out may give poses that differ by this, or by four standard deviations.
 _MOST_APART_M = 0.015
 _MOST_APART_DEG = 0.1

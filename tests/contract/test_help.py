@@ -231,6 +231,7 @@ def test_the_root_offers_its_names_without_loading_them() -> None:
         "print(sorted(name for name in mlbatch.__all__ if getattr(mlbatch, name) is not None))"
     )
     names = [
-        *("MlbatchError", "Recording", "Run", "Scan", "convert", "digest", "inspect", "open"),
+        *("Calibration", "MlbatchError", "Recording", "Run", "Scan", "calibrate", "convert"),
+        *("digest", "inspect", "open"),
     ]
     assert printed.strip() == str([*names, "read", "scans", "verify"])
