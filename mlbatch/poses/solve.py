@@ -22,8 +22,10 @@ from mlbatch.poses.surfaces import Distances, Planes, at_rows, distances, planes
 
 # Cauchy kernel: residuals of this many standard deviations have half of their weight.
 _KERNEL = 2.5
-# Observations this near to each other in the body frame are not independent, m.
-_BLOCK_M = 3.0
+# Observations in one sector of the body frame, and in a ring where radii differ by this factor, are
+# not independent: a tree ahead stays ahead from place to place.
+_SECTORS = 36
+_RING = 2.0
 # A turn by 1 rad moves what is this far by as much, m.
 _LEVER_M = 10.0
 # What a direction needs to be determined: a standard deviation, m and (by _LEVER_M) rad; the share
@@ -83,17 +85,20 @@ class State:
 class Level:
     """How surfaces are matched: edge of cells, least cosine between normals, most distance.
 
-    points: most of a cloud that are used, about.
+    points: most of a cloud that are used, about; also_m: edges of more cells.
     """
 
     edge_m: float
     parallel: float
     most_m: float
     points: int = 1 << 40
+    also_m: tuple[float, ...] = ()
 
 
 FINE = Level(0.5, 0.97, 0.15)
 LEVELS = (Level(2.0, 0.9, 1.0, 20_000), Level(1.0, 0.94, 0.4, 40_000), FINE)
+# Few beams have planes in large cells only, ground among plants in small ones only.
+_ALL_CELLS = Level(0.5, 0.97, 0.15, also_m=(0.25, 1.0, 2.0))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -169,13 +174,17 @@ class Problem:
 
     def _place_rows(self, number: int, state: State, level: Level) -> Rows:
         place = self.places[number]
-        surfaces = self.clouds(number, state, level.edge_m, level.points)
+        surfaces = [
+            self.clouds(number, state, edge_m, level.points)
+            for edge_m in (level.edge_m, *level.also_m)
+        ]
         uprights = self.stems(number, state)
         parts = []
         for first, second in combinations(range(len(place)), 2):
             pair = place[first].lidar, place[second].lidar
-            found = distances(surfaces[first], surfaces[second], level.parallel, level.most_m)
-            parts.append(self._rows(pair, found, state.twists[number]))
+            for of_edge in surfaces:
+                found = distances(of_edge[first], of_edge[second], level.parallel, level.most_m)
+                parts.append(self._rows(pair, found, state.twists[number]))
             one, other = uprights[first], uprights[second]
             if one is not None and other is not None:
                 axes = stem_distances(one, other, level.parallel, level.most_m)
@@ -195,12 +204,13 @@ class Problem:
 
     def _rows(self, pair: tuple[int, int], found: Distances, twist: F64Array) -> Rows:
         weight = 1.0 / found.sigma_m[:, None]
-        cell = np.floor(found.at_m / _BLOCK_M).astype(np.int64) + 5000
+        sector = np.arctan2(found.at_m[:, 1], found.at_m[:, 0]) * (_SECTORS / (2 * np.pi))
+        ring = np.log(np.hypot(found.at_m[:, 0], found.at_m[:, 1]) + 1.0) / np.log(_RING)
         return Rows(
             self._jacobian(pair, found, found.normal, twist) * weight,
             self._jacobian(pair, found, found.tilt, twist) * weight,
             found.distance_m / found.sigma_m,
-            (cell[:, 0] * 10000 + cell[:, 1]) * 10000 + cell[:, 2],
+            np.floor(sector).astype(np.int64) * 100 + np.floor(ring).astype(np.int64),
             np.tile(np.array(pair), (len(found), 1)),
         )
 
@@ -286,7 +296,7 @@ def find_poses(
     problem = Problem(places, lidars)
     for level in LEVELS[:-1]:
         state = solve(problem, state, level).state
-    return solve(Problem(places, lidars, delays=delays), state, LEVELS[-1])
+    return solve(Problem(places, lidars, delays=delays), state, _ALL_CELLS)
 
 
 def _is_small(problem: Problem, step: F64Array) -> bool:

@@ -92,7 +92,8 @@ def stems(points_m: F64Array, time_s: F64Array, origin_m: F64Array) -> Stems:
     high2, width2, width4, deep1, deep_width, deep2 = (
         np.add.reduceat(terms, first, axis=0) / count[:, None]
     ).T
-    radius_m = np.sqrt(3.0 * width2 * count / (count - 1))
+    between = _between_columns(across, first)
+    radius_m = np.sqrt(3.0 * (width2 + between))
     kurtosis = width4 / (width2**2 + 1e-12)
     spread = width4 - width2**2
     curve = (deep_width - deep1 * width2) / (spread + 1e-12)
@@ -101,10 +102,24 @@ def stems(points_m: F64Array, time_s: F64Array, origin_m: F64Array) -> Stems:
     good &= _within(curve * radius_m, _CURVED)
     good &= rough_m < _ROUGH_M + _ROUGH_SHARE * radius_m
     axis_m = mean + np.pi / 4 * radius_m[:, None] * view
-    # Points stand in columns, about 5 across, so that their mean is better than at random.
-    sigma_m = np.sqrt(_FLOOR_M**2 + radius_m**2 / 3 / (5 * count))
+    # Either edge is somewhere between two columns.
+    sigma_m = np.sqrt(_FLOOR_M**2 + between / 2)
     mean_s = np.add.reduceat(time_s[rows], first) / count
     return Stems(axis_m[good], along, radius_m[good], sigma_m[good], mean_s[good])
+
+
+def _between_columns(across_m: F64Array, first: I64Array) -> F64Array:
+    """Variance (k,) that the width between columns adds to that of their points, m2.
+
+    across_m: (n,), of the points of groups that begin at first (k,).
+    """
+    count = np.diff(first, append=len(across_m))
+    order = np.lexsort((across_m, np.repeat(np.arange(len(first)), count)))
+    gap = np.diff(across_m[order], append=0.0)
+    # Not from the last point of a group to the next group.
+    gap[first + count - 1] = 0.0
+    found: F64Array = np.add.reduceat(gap**3, first) / (np.add.reduceat(gap, first) + 1e-9)
+    return found / 12.0
 
 
 def _within(values: F64Array, limits: tuple[float, float]) -> BoolArray:
@@ -167,14 +182,14 @@ def stem_distances(first: Stems, second: Stems, parallel: float, most_m: float) 
         return None
     along = first.along + second.along
     along /= np.linalg.norm(along)
-    apart = second.axis_m[None, :, :] - first.axis_m[:, None, :]
-    high = apart @ along
-    apart = apart - high[:, :, None] * along
-    far = np.linalg.norm(apart, axis=2)
+    ways = np.linalg.svd(along[None])[2][1:]
+    one, other = np.matmul(first.axis_m, ways.T), np.matmul(second.axis_m, ways.T)
+    high = (second.axis_m @ along)[None, :] - (first.axis_m @ along)[:, None]
+    far = (other[None, :, 0] - one[:, None, 0]) ** 2 + (other[None, :, 1] - one[:, None, 1]) ** 2
     far[np.abs(high) > _MOST_ALONG_M] = np.inf
     right = np.argmin(far, axis=1)
     left = np.arange(len(first))
-    kept = (np.argmin(far, axis=0)[right] == left) & (far[left, right] < most_m)
+    kept = (np.argmin(far, axis=0)[right] == left) & (far[left, right] < most_m**2)
     left, right = left[kept], right[kept]
     # A radius that differs says that they are two stems.
     ratio = first.radius_m[left] / second.radius_m[right]
@@ -182,7 +197,6 @@ def stem_distances(first: Stems, second: Stems, parallel: float, most_m: float) 
     left, right = left[kept], right[kept]
     if not len(left):
         return None
-    ways = np.linalg.svd(along[None])[2][1:]
     middle_m = (first.axis_m[left] + second.axis_m[right]) / 2
     # Each along its own direction to the height of the middle.
     half = high[left, right, None] / 2

@@ -10,6 +10,7 @@ import sys
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -88,6 +89,8 @@ WALL = {
 # lidar against the first, body frame along the world's.
 DEGENERATE = {"corridor": CORRIDOR, "plane": PLANE, "wall": WALL}
 HARVESTER = "harvester-hard"
+# Of the harvester with its boom, as --exclude-box leaves it out.
+MACHINE = np.array([[-2.3, -1.15, 0.4], [6.5, 1.15, 4.5]])
 SCENES = ("room", "street", "forest-easy", "forest-hard", HARVESTER)
 
 
@@ -161,24 +164,20 @@ def origins(folder: Path, scene: str, rig: int) -> list[F64Array]:
 
 
 def places_of(folder: Path, scene: str, rig: int, numbers: list[int]) -> list[list[Cloud]]:
-    """Places at the true poses: two windows from each of the numbers."""
+    """Places at the true poses: two windows from each of the numbers, without the machine."""
+    box = MACHINE if scene == HARVESTER else np.zeros((2, 3))
     origin_m = origins(folder, scene, rig)
     with np.load(folder / f"{scene}-{rig + 2}.npz") as stored:
         found = []
         for number in numbers:
             instant_ns = int(stored[f"window_{number}"][1])
-            found.append(
-                [
-                    Cloud(
-                        lidar,
-                        stored[f"xyz_{at}_{lidar}"].astype(np.float64),
-                        (stored[f"time_{at}_{lidar}"] - instant_ns) * 1e-9,
-                        origin_m[lidar],
-                    )
-                    for at in (number, number + 1)
-                    for lidar in range(rig + 2)
-                ]
-            )
+            clouds = []
+            for at, lidar in product((number, number + 1), range(rig + 2)):
+                points_m = stored[f"xyz_{at}_{lidar}"].astype(np.float64)
+                kept = ((points_m < box[0]) | (points_m > box[1])).any(axis=1)
+                time_s = (stored[f"time_{at}_{lidar}"] - instant_ns) * 1e-9
+                clouds.append(Cloud(lidar, points_m[kept], time_s[kept], origin_m[lidar]))
+            found.append(clouds)
         return found
 
 
