@@ -15,7 +15,8 @@ from mlbatch.units import NS_PER_MS
 # Values (windows x sensors) of a page; longer runs are summarised, several windows a value.
 MOST_CELLS = 160_000
 _LARGEST = 2**62
-# Share of an estimated number of columns that is no loss: rotors vary.
+# Share of an estimated number of columns that is no loss, since rotors vary; and of a known one,
+# if a single column lacks.
 _NEARLY = 0.99
 # No delay of a network.
 _FAR_MS = 60_000.0
@@ -160,7 +161,8 @@ def _fill(columns: I64Array, expected: I64Array, estimated: BoolArray, known: F6
     is_whole = (expected == 0) | ((columns > 0) & (expected - columns <= 1))
     is_whole |= estimated & (share >= _NEARLY)
     own = np.where(is_whole, 1.0, share)
-    return np.clip(np.where(np.isfinite(known), known, own), 0.0, 1.0)
+    table = np.where(is_whole & (known >= _NEARLY), 1.0, known)
+    return np.clip(np.where(np.isfinite(known), table, own), 0.0, 1.0)
 
 
 @dataclass(frozen=True, slots=True)

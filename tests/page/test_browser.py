@@ -18,7 +18,7 @@ from tests.builders.sessions import FIXTURE
 from tests.contract.tree import run_mlbatch
 from tests.page.browser import CHROMIUM, NO_CHROMIUM, Browser, browser
 from tests.page.runs import report, sensor, table
-from tests.page.test_page import HOSTILE
+from tests.page.test_page import HOSTILE, plot_data, points_of
 
 pytestmark = pytest.mark.skipif(CHROMIUM is None, reason=NO_CHROMIUM)
 
@@ -209,6 +209,23 @@ def test_the_cloud_has_keys_and_names_a_point(tab: Browser, real_page: Path) -> 
     tab.hover("#cloud", 0.5, 0.5)
     assert tab.run("document.getElementById('cloud').toDataURL()") != before
     assert tab.errors == []
+
+
+def test_the_browser_unpacks_what_the_page_has(tab: Browser, real_page: Path) -> None:
+    """The first lidar has lost a tenth of its packets."""
+    tab.open(real_page)
+    data = "JSON.parse(document.getElementById('data').textContent)"
+    for number, cloud in enumerate(plot_data(real_page)["clouds"][:2]):
+        tab.run(f"unpackCloud({data}.clouds[{number}]).then(c => {{ window.unpacked = c; }})")
+        wait_for(tab, "window.unpacked && window.unpacked.title", cloud["title"])
+        shown = points_of(cloud)
+        steps = np.rint((shown.xyz - cloud["low"]) / cloud["step"]).astype(int)
+        assert tab.run("[...unpacked.steps]") == steps.ravel().tolist()
+        assert tab.run("[...unpacked.ring]") == shown.ring.tolist()
+        assert tab.run("[...unpacked.lidar]") == shown.lidar.tolist()
+        assert tab.run("[...unpacked.bright]") == shown.intensity.tolist()
+        time_ms = np.array(tab.run("[...unpacked.time]")) / 65535 * cloud["window_ms"]
+        np.testing.assert_allclose(time_ms, shown.time_ms, rtol=0, atol=1e-9)
 
 
 def test_without_webgl_the_points_are_drawn_and_it_is_said(tab: Browser, real_page: Path) -> None:

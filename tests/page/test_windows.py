@@ -51,13 +51,17 @@ def test_windows_have_gap_delay_and_span() -> None:
 
 
 def test_the_fill_of_the_table_counts() -> None:
-    """A lidar that is dark in a part of the revolution has fewer columns than its rate says."""
-    text = table(("left",), [[256], [512]], [[0], [0]])
-    head, first, second = text.splitlines()
-    text = "\n".join([f"{head},fill_left", f"{first},0.5", f"{second},"])
-    found = read_windows(text, 1)
+    """A lidar that is dark in a part of the revolution has fewer columns than its rate says.
+
+    A single column less is the grid between two columns, in the table as well.
+    """
+    text = table(("left",), [[256], [512], [511], [510]], [[0], [0], [1], [2]])
+    head, *rows = text.splitlines()
+    fills = ("0.5", "", "0.998", "0.996")
+    cells = [f"{row},{fill}" for row, fill in zip(rows, fills, strict=True)]
+    found = read_windows("\n".join([f"{head},fill_left", *cells]), 1)
     assert found is not None
-    np.testing.assert_array_equal(found.fill, [[0.5], [1.0]])
+    np.testing.assert_array_equal(found.fill, [[0.5], [1.0], [1.0], [0.996]])
 
 
 def test_the_worst_window_is_neither_head_nor_tail() -> None:
