@@ -19,11 +19,11 @@ from mlbatch.outputs.stored_scan import StoredScan
 from mlbatch.page.points import PageCloud, Place, page_cloud
 from mlbatch.page.windows import Windows
 
-# Characters of the scans of a page, and points, of 4 characters or less each.
+# Characters of the scans of a page; of scans that were asked for, what browsers open.
 _MOST_CHARS = 3_000_000
-_MOST_POINTS = 750_000
-# Of scans that were asked for: what browsers open.
-_MOST_POINTS_ASKED = 40_000_000
+_MOST_CHARS_ASKED = 160_000_000
+# Of a point, where many are asked for.
+_CHARS_PER_POINT = 4
 # First, middle and worst.
 _LEAST_SCANS = 3
 # Scans in memory.
@@ -41,14 +41,17 @@ def chosen_clouds(output: Path, windows: Windows, scans: int | None) -> list[Pag
     places = choose_places(windows, _LEAST_SCANS if scans is None else scans)
     if scans is None:
         places = [place for place in places if place.title]
-    most = _MOST_POINTS if scans is None else _MOST_POINTS_ASKED
-    stride = max(1, -(-int(windows.points[[one.row for one in places]].sum()) // most))
+    most = _MOST_CHARS if scans is None else _MOST_CHARS_ASKED
+    stride = 1
+    if scans is not None:
+        points = int(windows.points[[one.row for one in places]].sum())
+        stride = max(1, -(-points * _CHARS_PER_POINT // most))
     clouds = read_clouds(output, places, windows, stride)
-    if scans is not None or stride > 1 or not clouds:
-        return clouds
     chars = [one.chars for one in clouds]
-    room = max(0, _MOST_CHARS - sum(chars)) // max(1, *chars)
-    if room:
+    if sum(chars) > most:
+        return read_clouds(output, places, windows, -(-stride * sum(chars) // most))
+    room = (most - sum(chars)) // max(1, *chars, 1)
+    if scans is None and room:
         more = choose_places(windows, len(places) + room)
         clouds += read_clouds(output, [one for one in more if one not in places], windows)
     return sorted(clouds, key=lambda one: one.place.row)

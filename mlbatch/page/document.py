@@ -424,7 +424,7 @@ def _cloud_data(cloud: PageCloud, windows: Windows) -> dict[str, Any]:
         "height": cloud.height_m,
         "centre": cloud.centre_m,
         "view": cloud.view_m,
-        "window_ms": cloud.window_ms,
+        "times": cloud.times_ms,
         "has": {"lidar": cloud.has_lidar, "time": cloud.has_time, "ring": cloud.has_ring},
         "data": base64.b64encode(cloud.packed).decode(),
     }

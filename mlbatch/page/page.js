@@ -346,8 +346,10 @@
       // Plus zero: no sign of a rounded zero.
       const [low, high] = cloud.height.map((one) => (Math.round(one * 10) / 10 + 0).toFixed(1));
       item("height " + low + " to " + high + " m", ramp);
-    } else if (colouring === "time") item("time 0 to " + cloud.window_ms.toFixed(0) + " ms", ramp);
-    else item("intensity, 2 % to 98 % of the points", ramp);
+    } else if (colouring === "time") {
+      const [low, high] = cloud.times.map((one) => one.toFixed(0));
+      item("time " + low + " to " + high + " ms", ramp);
+    } else item("intensity, 2 % to 98 % of the points", ramp);
   }
 
   function startClouds() {
@@ -388,7 +390,9 @@
     };
     const step = async () => {
       await show((chosen + 1) % clouds.length);
-      if (playing !== null) playing = setTimeout(step, data.play_ms);
+      if (playing === null) return;
+      pointsOf((chosen + 1) % clouds.length);
+      playing = setTimeout(step, data.play_ms);
     };
     const toggle = () => {
       if (playing !== null) { stop(); return; }

@@ -10,6 +10,7 @@ import numpy as np
 from mlbatch.arrays import BoolArray, F32Array, F64Array, I64Array, U8Array, U16Array
 from mlbatch.outputs.stored_scan import StoredScan
 from mlbatch.page.windows import Windows
+from mlbatch.units import NS_PER_MS
 
 # Finest step of coordinates, below the noise of lidars.
 _STEP_M = 0.005
@@ -37,7 +38,7 @@ class PageCloud:
     """A scan as the page stores it.
 
     packed: deflated planes of its `shown` points, in this order: x, y, z in steps from the lowest,
-    time in 1/65535 of the window, ring, as differences in 16 bits (see `_differences`), then lidar
+    time in 1/65535 of `times_ms`, ring, as differences in 16 bits (see `_differences`), then lidar
     and intensity, in 8 bits.
     """
 
@@ -48,7 +49,7 @@ class PageCloud:
     packed: bytes
     low_m: tuple[float, float, float]
     step_m: float
-    window_ms: float
+    times_ms: tuple[float, float]  # the window, and what fused sweeps have beyond
     height_m: tuple[float, float]  # range of the colours
     centre_m: tuple[float, float, float]  # of the first view
     view_m: float  # radius around the centre that contains most points of every lidar
@@ -86,6 +87,8 @@ def page_cloud(
     times = [part.time_ns for part in parts if part.time_ns is not None]
     rings = [part.ring for part in parts if part.ring is not None]
     bright = [part.intensity for part in parts if part.intensity is not None]
+    first_ns = min(0, *(int(one.min(initial=0)) for one in times))
+    last_ns = max(window_ns, *(int(one.max(initial=0)) for one in times))
     has_lidar = len(lidars) == len(parts)
     has_time = len(times) == len(parts)
     has_ring = len(rings) == len(parts)
@@ -112,14 +115,14 @@ def page_cloud(
         shown=len(xyz),
         packed=_packed(
             np.rint((xyz - low_m) / step_m).astype(np.uint16),
-            np.rint(np.clip(share[order] if has_time else 0 * share[order], 0, 1) * _WORD),
+            np.rint((time_ns[order] - first_ns) / (last_ns - first_ns) * _WORD),
             ring[order],
             lidar[order],
             _bytes_of(intensity[order]),
         ),
         low_m=(float(low_m[0]), float(low_m[1]), float(low_m[2])),
         step_m=step_m,
-        window_ms=window_ns / 1e6,
+        times_ms=(first_ns / NS_PER_MS, last_ns / NS_PER_MS),
         height_m=_span(xyz[:, 2]),
         centre_m=(float(centre_m[0]), float(centre_m[1]), float(centre_m[2])),
         view_m=view_m,

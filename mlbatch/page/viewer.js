@@ -401,6 +401,9 @@ function makeViewer(canvas, names, poses, say) {
     if (found || pointed) { pointed = found; draw(); }
   }
 
+  const timeOf = (i) =>
+    cloud.times[0] + cloud.time[i] / 65535 * (cloud.times[1] - cloud.times[0]);
+
   function wordsOf(i) {
     const place = [0, 1, 2].map((k) => cloud.low[k] + cloud.step * cloud.steps[3 * i + k]);
     const pose = cloud.has.lidar ? poses[cloud.lidar[i]] : null;
@@ -410,7 +413,7 @@ function makeViewer(canvas, names, poses, say) {
       cloud.has.lidar && names[cloud.lidar[i]],
       cloud.has.ring && "ring " + cloud.ring[i],
       range.toFixed(2) + " m from the " + (pose ? "lidar" : "body"),
-      cloud.has.time && "+" + (cloud.time[i] / 65535 * cloud.window_ms).toFixed(2) + " ms",
+      cloud.has.time && (timeOf(i) < 0 ? "" : "+") + timeOf(i).toFixed(2) + " ms",
       place.map((one) => one.toFixed(2)).join(", ") + " m",
     ].filter(Boolean);
   }

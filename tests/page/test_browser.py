@@ -224,7 +224,7 @@ def test_the_browser_unpacks_what_the_page_has(tab: Browser, real_page: Path) ->
         assert tab.run("[...unpacked.ring]") == shown.ring.tolist()
         assert tab.run("[...unpacked.lidar]") == shown.lidar.tolist()
         assert tab.run("[...unpacked.bright]") == shown.intensity.tolist()
-        time_ms = np.array(tab.run("[...unpacked.time]")) / 65535 * cloud["window_ms"]
+        time_ms = np.array(tab.run("[...unpacked.time]")) / 65535 * cloud["times"][1]
         np.testing.assert_allclose(time_ms, shown.time_ms, rtol=0, atol=1e-9)
 
 
