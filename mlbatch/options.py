@@ -400,6 +400,13 @@ CONVERT: Final = (
         "strict", FLAG, "Run", "The first rejected packet or warning is an error.", default=False
     ),
     Option(
+        "no_pose_check",
+        FLAG,
+        "Run",
+        "Do not compare the surfaces that lidars see, which checks their poses.",
+        default=False,
+    ),
+    Option(
         "fail_on",
         TEXTS,
         "Run",

@@ -44,6 +44,7 @@ REMEDIES = {
     "identity_extrinsics": "give the poses in a rig file (--rig); without them clouds do not merge",
     "far_pose": "give translation_m in metres, from an origin on the vehicle",
     "pose_gravity": "correct the pose in the rig file, or the name of its body frame",
+    "pose": "measure the poses with mlbatch calibrate, and correct them in the rig file (--rig)",
     "radians": "give rotation_rpy_deg in degrees",
     "same_pose": "correct the pose of one of them in the rig file",
     "constant_tf": "nothing to do if the sensor does not move; else publish on /tf_static",

@@ -26,6 +26,7 @@ from mlbatch.pipeline.passthrough import Passthrough
 from mlbatch.pipeline.sensor import Sensor
 from mlbatch.pipeline.session import Session
 from mlbatch.report.ledger import PointCounts
+from mlbatch.report.poses import NOT_ASKED, ONE_LIDAR, PoseFigures
 from mlbatch.report.scan_table import ScanTable
 from mlbatch.types import BYTE_INTENSITY, ImuSamples, Message, RunInfo, Scan, Topic
 from mlbatch.units import NS_PER_MS, NS_PER_S, rate_text
@@ -35,6 +36,7 @@ if TYPE_CHECKING:
     from mlbatch.batching.sweeps import SweepCutter
     from mlbatch.pipeline.constant_velocity import ConstantVelocity
     from mlbatch.pipeline.deskew import Deskew, PoseSource
+    from mlbatch.pipeline.pose_check import PoseCheck
 
 # Called with the bytes read so far, the bytes of all recordings, and the scans so far.
 Progress = Callable[[int, int, int], None]
@@ -93,8 +95,9 @@ class SkippedWindow(NamedTuple):
 class Conversion:
     """One run: `windows`, `tasks` or `scans` drive it, `close` ends it.
 
-    info, table: None before the first window; dropped_incomplete: windows left out by
-    `--drop-incomplete`; notes_before_points: number of warnings that precede those about points.
+    info, table: None before the first window; poses: known once closed; dropped_incomplete:
+    windows left out by `--drop-incomplete`; notes_before_points: number of warnings that precede
+    those about points.
     """
 
     def __init__(self, job: Job, buffers: int = 1, progress: Progress | None = None) -> None:
@@ -133,6 +136,8 @@ class Conversion:
         self.dropped_incomplete = 0
         self.notes_before_points = 0
         self.deskew = self._deskew()
+        self.poses = PoseFigures(ONE_LIDAR if job.checks_poses else NOT_ASKED)
+        self._pose_check = self._new_pose_check()
         self._buffers = buffers
         self._pool: DecodePool | None = None
         if job.max_wait_ns is None:
@@ -179,6 +184,14 @@ class Conversion:
         else:
             source = Trajectory(Path(job.deskew))
         return Deskew(source, job.deskew_to, job.max_wait_ns, points, len(self.sensors))
+
+    def _new_pose_check(self) -> PoseCheck | None:
+        """The object that compares what lidars see; None for one, and with `--no-pose-check`."""
+        if not self.job.checks_poses or len(self.sensors) < 2:
+            return None
+        from mlbatch.pipeline.pose_check import PoseCheck
+
+        return PoseCheck(self.sensors, self.job.slices, self._plain_decoder)
 
     def _topic_offset_ns(self, topic: Topic) -> int | None:
         """Scan clock minus receive time, as for messages of an IMU that are forwarded."""
@@ -251,6 +264,8 @@ class Conversion:
 
     def _batches(self, windows: Iterator[Window]) -> Iterator[Window]:
         """Yield what becomes a scan: windows, or the sets of sweeps in them, with their moves."""
+        if self._pose_check is not None:
+            windows = self._checked(windows, self._pose_check)
         batches = windows if self.fusion is None else self.fusion.sets(windows)
         if self.deskew is None:
             yield from batches
@@ -258,6 +273,12 @@ class Conversion:
         for window in batches:
             yield from self.deskew.push(window)
         yield from self.deskew.finish()
+
+    @staticmethod
+    def _checked(windows: Iterator[Window], check: PoseCheck) -> Iterator[Window]:
+        for window in windows:
+            check.add(window)
+            yield window
 
     def scans(self, progress: Progress | None = None) -> Iterator[tuple[Scan, int | None]]:
         """Yield every scan and, with `--split`, the index of its sensor.
@@ -436,6 +457,8 @@ class Conversion:
         for sensor in self.sensors:
             self._complete_ledger(sensor)
         self._refuse_rejected()
+        if self._pose_check is not None:
+            self.poses = self._pose_check.figures()
         for note in run_report.final_notes(self):
             self.warn(note)
         self.notes_before_points = len(self.notes)

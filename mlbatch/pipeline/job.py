@@ -95,6 +95,7 @@ class Job:
     batching_times: str = COMMON  # or own
     deskew: str = ""  # where poses come from: imu, or the path of a trajectory; "": no motion
     deskew_to: str = INSTANTS[0]  # instant of a window that its points are moved to
+    checks_poses: bool = True  # compares what lidars see of the same surfaces
     max_bag_s: float = 0.0  # recorded time in a file of a ROS 2 bag, s; 0: all in one file
     shard: Shard | None = None  # the only scans to make; None: all
     jobs: int = 1  # scans made at the same time

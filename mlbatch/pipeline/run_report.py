@@ -56,6 +56,7 @@ def run_report(run: Conversion) -> RunReport:
         sort=run.job.sort,
         variants=run.job.variants,
         deskew=None if run.deskew is None else run.deskew.ledger,
+        poses=run.poses,
         capture=_capture(run),
         sensors=tuple(_sensor(run, sensor) for sensor in run.sensors),
         scans=_NO_SCANS
@@ -146,11 +147,23 @@ def _epoch_notes(run: Conversion) -> Iterator[Note]:
     yield Note("clock_epoch", off[0] if len(run.sensors) == 1 else "", text)
 
 
+def _pose_notes(run: Conversion) -> Iterator[Note]:
+    """Lidars whose surfaces are proven to be apart."""
+    for pair in run.poses.pairs:
+        if pair.is_wrong:
+            text = (
+                f"{pair.describe()}; correct the poses in the rig file (--rig), or measure them "
+                "(mlbatch calibrate)"
+            )
+            yield Note("pose", "", text)
+
+
 def final_notes(run: Conversion) -> list[Note]:
     """Warnings known at the end of a run only: damaged recordings, lidars that start late."""
     notes = [note for recording in run.session.recordings for note in _damage(recording)]
     notes += _cloud_notes(run)
     notes += _epoch_notes(run)
+    notes += _pose_notes(run)
     for sensor in run.sensors:
         packets = sensor.ledger.packets
         # A packet captured twice is no loss, but another packet of the same number is.

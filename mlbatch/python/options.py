@@ -118,6 +118,7 @@ class WindowOptions(TypedDict, total=False):
     batching_times: str
     deskew: AnyPath | None  # "imu", "constant-velocity", or the path of a trajectory
     deskew_to: str | None
+    no_pose_check: bool
 
 
 class RatedOptions(WindowOptions, total=False):
@@ -266,6 +267,7 @@ def window_job(job: Job, options: RatedOptions, shown: Callable[[str], str] = _a
         batching=options.get("batching", "window"),
         batching_times=options.get("batching_times", "common"),
         deskew=str(path_of("deskew", options.get("deskew")) or ""),
+        checks_poses=not options.get("no_pose_check", False),
         deskew_to=choice(shown("deskew_to"), deskew_to or INSTANTS[0], INSTANTS),
     )
     return check_deskew(check_batching(job), deskew_to is not None)

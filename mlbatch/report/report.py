@@ -12,7 +12,7 @@ import mlbatch
 from mlbatch.arrays import F64Array
 from mlbatch.bounded import parse_json
 from mlbatch.errors import RecordingError
-from mlbatch.report.json_records import from_json
+from mlbatch.report.json_records import from_json, to_json
 from mlbatch.report.ledger import (
     CAPTURE_REASONS,
     COLUMN_REASONS,
@@ -26,6 +26,7 @@ from mlbatch.report.ledger import (
     ordered,
 )
 from mlbatch.report.motion import MotionLedger
+from mlbatch.report.poses import PoseFigures
 from mlbatch.report.scan_table import ScanStatistics
 from mlbatch.types import VARIANTS, CaptureCounts
 from mlbatch.units import NS_PER_S
@@ -153,6 +154,7 @@ class RunReport(NamedTuple):
     first_scan: str = ""  # start of the first scan, as text
     variants: tuple[tuple[str, str], ...] = ()  # as `RunInfo.variants`
     deskew: MotionLedger | None = None  # with --deskew
+    poses: PoseFigures | None = None  # None: of an earlier version
     command: str = ""  # command line; "" for runs by the Python interface
     identity: dict[str, str] | None = None  # of the job, see `identity_of_parts`
     version: str = mlbatch.__version__
@@ -252,6 +254,7 @@ def build_report(run: RunReport) -> Section:
         "messages": [item._asdict() for item in run.messages],
         **({"faults": [item._asdict() for item in run.faults]} if run.faults else {}),
         **({"deskew": dict(run.deskew.as_json())} if run.deskew is not None else {}),
+        **({} if run.poses is None else {"poses": _section(to_json(run.poses))}),
         "scans": _scans(run.scans),
         "timing": {} if run.timing is None else _timing(run.timing),
         "warnings": [item._asdict() for item in run.warnings],

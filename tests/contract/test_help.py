@@ -23,7 +23,8 @@ OPTIONS: dict[str, set[str]] = {
             start end clock align-clocks align-to on-jump min-range max-range exclude-box
             keep-repeated drop-incomplete pass copy-topic metadata identity-extrinsics
             decode only include-sensor ignore exclude-sensor fault fault-seed html dry-run
-            html-scans report shard jobs compression strict fail-on overwrite resume no-fsync quiet
+            html-scans report shard jobs compression strict no-pose-check fail-on overwrite
+            resume no-fsync quiet
             verbose
         """,
         "merge": "output fail-on overwrite no-fsync quiet",

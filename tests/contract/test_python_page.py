@@ -74,6 +74,7 @@ WINDOWS = {
     "batching_times": "own",
     "deskew": "constant-velocity",
     "deskew_to": "end",
+    "no_pose_check": True,
 }
 OUTPUT = {
     "copy_topics": "/tf",

@@ -1,0 +1,368 @@
+"""Whether the surfaces that two lidars see fit, with the poses of a run.
+
+Each place, two windows that follow each other, gives an estimate of the corrections that the poses
+need, with its covariance; those of all places are joined by their weights, and what they differ
+more than expected counts as uncertainty (Birge ratio). A residual is proven only where several
+places agree on it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from itertools import combinations
+
+import numpy as np
+
+from mlbatch.arrays import F64Array
+from mlbatch.motion.se3 import log_rotation
+from mlbatch.poses.solve import LEVELS, Cloud, Place, Problem, Solution, State, solve
+from mlbatch.poses.surfaces import Planes, shared_cells
+from mlbatch.report.poses import MEASURED, MISFIT, NOT_CHECKED, OFF, PairFigures
+
+# A wrong pose: a residual above these is a warning.
+LIMIT_M = 0.03
+LIMIT_RAD = float(np.deg2rad(0.3))
+# Standard deviations by which it has to be above, and of what is determined at all.
+_PROOF = 4.0
+_MOST_SIGMA_M = 0.015
+_MOST_SIGMA_RAD = float(np.deg2rad(0.15))
+# Places that agree, at least.
+_LEAST_PLACES = 2
+# Places are compared until so many were, or none is left; enough if all is clear.
+_MOST_PLACES = 6
+_ENOUGH = 3
+# Points of a cloud that are used, and where few surfaces are matched, all.
+_POINTS = 11_000
+_FEW_SURFACES = 40
+# Surfaces in common below which nothing is said, and the share of them that fits with good poses.
+_LEAST_SURFACES = 12
+_MISFIT = 0.5
+_FITS = 0.8
+# Turns by which what is 10 m away moves as far, as in `solve`.
+_LEVER_M = 10.0
+_SCALE = np.array([1.0, 1.0, 1.0, _LEVER_M, _LEVER_M, _LEVER_M])
+# Of directions that a place does not determine, m2.
+_UNKNOWN_M2 = 1e4
+# What is not modelled: standard deviations are never smaller.
+_FLOOR_M = 0.001
+_FLOOR_RAD = float(np.deg2rad(0.005))
+_COARSE, _MIDDLE, _FINE = LEVELS
+# Steps at each level where something seems to be off.
+_STEPS = 8
+# An axis is named if the direction is within 25 degrees of it.
+_ALONG_AXIS = 0.9
+
+
+class _Watched(Problem):
+    """A problem that keeps the planes that it was first asked for."""
+
+    def __init__(self, place: Place, lidars: int) -> None:
+        super().__init__([place], lidars)
+        self.first: list[Planes] = []
+
+    def clouds(
+        self, place: int, state: State, edge_m: float, points: int = 1 << 40
+    ) -> list[Planes]:
+        found = super().clouds(place, state, edge_m, points)
+        self.first = self.first or found
+        return found
+
+
+@dataclass(slots=True)
+class _Pair:
+    """Surfaces of two lidars in all places: in both, in the one that has fewer, that fit."""
+
+    both: int = 0
+    fewer: int = 0
+    fit: int = 0
+
+    def add(self, first: Planes, second: Planes) -> None:
+        """Count the surfaces of two clouds of one window."""
+        left, right = shared_cells(first, second)
+        apart_m = second.mean_m[right] - first.mean_m[left]
+        cosine = np.abs((first.normal[left] * second.normal[right]).sum(axis=1))
+        distance_m = np.abs((first.normal[left] * apart_m).sum(axis=1))
+        fits = (cosine >= _MIDDLE.parallel) & (distance_m <= _MIDDLE.most_m)
+        self.both += len(left)
+        self.fewer += min(len(first.key), len(second.key))
+        self.fit += int(np.count_nonzero(fits))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Estimate:
+    """Corrections (u,) of a place or all, six of each lidar but the first, turns by `_LEVER_M`.
+
+    covariance, information: (u, u).
+    """
+
+    value: F64Array
+    covariance: F64Array
+    information: F64Array
+
+
+class PoseComparison:
+    """Takes places, says how the surfaces of each two lidars fit."""
+
+    def __init__(
+        self,
+        names: Sequence[str],
+        body_from_sensor: Sequence[F64Array],
+        *,
+        tries_swapped: bool = True,
+    ) -> None:
+        """body_from_sensor: (4, 4) of each lidar, m, as the points are converted."""
+        self.places = 0
+        self._names = names
+        self._poses = body_from_sensor
+        self._tries_swapped = tries_swapped
+        self._pairs = {pair: _Pair() for pair in combinations(range(len(names)), 2)}
+        self._estimates: list[_Estimate] = []
+        # Of places where something seems to be off.
+        self._kept: list[Place] = []
+
+    @property
+    def is_settled(self) -> bool:
+        """Whether more places would add nothing."""
+        if self.places >= _MOST_PLACES:
+            return True
+        return self.places >= _ENOUGH and all(map(self._is_clear, self._measured()))
+
+    def add(self, place: Place) -> None:
+        """Compare the clouds of a place: a cloud of each lidar in a window, then in the next."""
+        self.places += 1
+        lidars = len(self._names)
+        problem = _Watched([_thinned(cloud) for cloud in place], lidars)
+        solution = solve(problem, State.start(lidars, 1), _MIDDLE, most_steps=1)
+        window = problem.first[:lidars]
+        misfit = False
+        for (one, other), pair in self._pairs.items():
+            now = _Pair()
+            now.add(window[one], window[other])
+            misfit |= now.both >= _LEAST_SURFACES and now.fit < _FITS * now.both
+            pair.both, pair.fewer = pair.both + now.both, pair.fewer + now.fewer
+            pair.fit += now.fit
+        matched = sum(count for (one, other), count in solution.matched.items() if one != other)
+        if matched < _FEW_SURFACES:
+            problem = _Watched(place, lidars)
+            solution = solve(problem, State.start(lidars, 1), _FINE, most_steps=3)
+        estimate = _estimate(solution)
+        is_off = misfit or (estimate is not None and _seems_off(estimate))
+        if is_off or estimate is None:
+            self._kept = [*self._kept, place][-_ENOUGH:]
+        if is_off:
+            state = solve(problem, State.start(lidars, 1), _COARSE, _STEPS).state
+            estimate = _estimate(solve(problem, state, _MIDDLE, _STEPS))
+        if estimate is not None:
+            self._estimates.append(estimate)
+
+    def figures(self) -> tuple[PairFigures, ...]:
+        """What is known of each pair."""
+        found = self._measured()
+        if not self._tries_swapped:
+            return found
+        return tuple(map(self._with_swapped, self._pairs, found))
+
+    def _with_swapped(self, key: tuple[int, int], pair: PairFigures) -> PairFigures:
+        if pair.outcome == MEASURED or not self._fits_swapped(key):
+            return pair
+        # That they fit with all directions determined is proof, too.
+        outcome = pair.outcome if pair.is_wrong else MISFIT
+        return pair._replace(outcome=outcome, reason="", swapped=True)
+
+    def _measured(self) -> tuple[PairFigures, ...]:
+        joined = _joined(self._estimates)
+        return tuple(self._figures(key, pair, joined) for key, pair in self._pairs.items())
+
+    @staticmethod
+    def _is_clear(pair: PairFigures) -> bool:
+        if not pair.is_known:
+            return False
+        if pair.is_wrong:
+            return True
+        shift_m = ((pair.shift_mm or 0.0) + _PROOF * (pair.shift_deviation_mm or 0.0)) / 1000.0
+        turn_deg = (pair.turn_deg or 0.0) + _PROOF * (pair.turn_deviation_deg or 0.0)
+        return shift_m <= LIMIT_M and np.deg2rad(turn_deg) <= LIMIT_RAD
+
+    def _figures(self, key: tuple[int, int], pair: _Pair, joined: _Estimate | None) -> PairFigures:
+        names = self._names[key[0]], self._names[key[1]]
+        if not pair.both:
+            return PairFigures(names, NOT_CHECKED, "they see nothing in common")
+        figures = PairFigures(
+            names,
+            NOT_CHECKED,
+            places=self.places,
+            surfaces=pair.both,
+            overlap_percent=round(100 * pair.both / pair.fewer, 1),
+            fit_percent=round(100 * pair.fit / pair.both, 1),
+        )
+        if pair.both < _LEAST_SURFACES * min(self.places, _LEAST_PLACES):
+            return figures._replace(reason=f"they have {pair.both} surfaces in common, too few")
+        if pair.fit < _MISFIT * pair.both and self.places >= _LEAST_PLACES:
+            return figures._replace(outcome=MISFIT)
+        if joined is None:
+            return figures._replace(reason="what they see in common determines nothing")
+        shift = self._part(key, joined, turn=False)
+        turn = self._part(key, joined, turn=True)
+        if shift.size is None and turn.size is None:
+            return figures._replace(reason="what they see in common determines nothing")
+        is_off = shift.is_proven or turn.is_proven
+        if not is_off and (shift.is_beyond or turn.is_beyond):
+            return figures._replace(reason="what is seen in one place contradicts the others")
+        return figures._replace(
+            outcome=OFF if is_off else MEASURED,
+            shift_mm=None if shift.size is None else round(1000 * shift.size, 1),
+            shift_deviation_mm=None if shift.size is None else round(1000 * shift.sigma, 1),
+            turn_deg=None if turn.size is None else round(float(np.rad2deg(turn.size)), 3),
+            turn_deviation_deg=None
+            if turn.size is None
+            else round(float(np.rad2deg(turn.sigma)), 3),
+            undetermined=(
+                *(f"shift along {axis}" for axis in shift.undetermined),
+                *(f"turn about {axis}" for axis in turn.undetermined),
+            ),
+        )
+
+    def _part(self, key: tuple[int, int], joined: _Estimate, *, turn: bool) -> _Part:
+        """Shift or turn of the second lidar of a pair, at its place."""
+        to_part = self._matrix(key, turn=turn)
+        value = np.matmul(to_part, joined.value)
+        covariance = _projected(to_part, joined.covariance)
+        most, limit = (_MOST_SIGMA_RAD, LIMIT_RAD) if turn else (_MOST_SIGMA_M, LIMIT_M)
+        floor = _FLOOR_RAD if turn else _FLOOR_M
+        variance, axes = np.linalg.eigh(covariance)
+        known = variance <= most**2
+        part = _Part(undetermined=tuple(map(_axis_name, axes.T[~known])))
+        if not known.any():
+            return part
+        determined = np.matmul(axes[:, known], np.matmul(axes[:, known].T, value))
+        part.size = float(np.linalg.norm(determined))
+        along = determined / part.size if part.size > floor else axes[:, known][:, -1]
+        part.sigma = max(floor, float(np.sqrt(along @ covariance @ along)))
+        part.is_beyond = part.size - _PROOF * part.sigma > limit
+        if part.is_beyond:
+            part.is_proven = self._agree(np.matmul(along, to_part), limit, most)
+        return part
+
+    def _agree(self, along: F64Array, limit: float, most: float) -> bool:
+        """Whether a residual along a direction of the corrections (u,) rests on no single place."""
+        for left_out in range(len(self._estimates)):
+            rest = _joined([*self._estimates[:left_out], *self._estimates[left_out + 1 :]])
+            if rest is None or float(along @ rest.covariance @ along) > (2 * most) ** 2:
+                return False
+            if float(along @ rest.value) < limit / 2:
+                return False
+        return True
+
+    def _matrix(self, key: tuple[int, int], *, turn: bool) -> F64Array:
+        """From corrections (u,) to shift, m, or turn, rad, of the second lidar at its place."""
+        size = 6 * (len(self._names) - 1)
+        found = np.zeros((3, size))
+        x, y, z = self._poses[key[1]][:3, 3]
+        # A turn about the body's origin shifts the lidar by turn x place.
+        lever = np.array([[0.0, z, -y], [-z, 0.0, x], [y, -x, 0.0]])
+        six = np.hstack([np.zeros((3, 3)), np.eye(3)] if turn else [np.eye(3), lever]) / _SCALE
+        for lidar, sign in zip(key, (-1.0, 1.0), strict=True):
+            if lidar:
+                found[:, 6 * (lidar - 1) : 6 * lidar] += sign * six
+        return found
+
+    def _fits_swapped(self, key: tuple[int, int]) -> bool:
+        """Whether surfaces fit with the poses of two lidars exchanged."""
+        one, other = (self._poses[lidar] for lidar in key)
+        moves = {key[0]: other @ np.linalg.inv(one), key[1]: one @ np.linalg.inv(other)}
+        poses = list(self._poses)
+        poses[key[0]], poses[key[1]] = other, one
+        comparison = PoseComparison(self._names, poses, tries_swapped=False)
+        for place in self._kept:
+            comparison.add([_moved(cloud, moves.get(cloud.lidar)) for cloud in place])
+        if comparison.places < _LEAST_PLACES:
+            return False
+        figures = comparison.figures()[list(self._pairs).index(key)]
+        return (
+            figures.outcome == MEASURED
+            and figures.shift_mm is not None
+            and figures.turn_deg is not None
+            and figures.fit_percent >= 100 * _FITS
+            and self._is_clear(figures)
+        )
+
+
+@dataclass(slots=True)
+class _Part:
+    """Length of a shift or turn in the directions that are determined, m or rad."""
+
+    size: float | None = None
+    sigma: float = 0.0
+    is_beyond: bool = False
+    is_proven: bool = False
+    undetermined: tuple[str, ...] = field(default=())
+
+
+def _thinned(cloud: Cloud) -> Cloud:
+    """Some of the points of a cloud."""
+    step = max(1, len(cloud.points_m) // _POINTS)
+    return Cloud(cloud.lidar, cloud.points_m[::step], cloud.time_s[::step], cloud.origin_m)
+
+
+def _moved(cloud: Cloud, move: F64Array | None) -> Cloud:
+    """A cloud with another pose of its lidar; move: (4, 4)."""
+    if move is None:
+        return cloud
+    points_m = np.matmul(cloud.points_m, move[:3, :3].T) + move[:3, 3]
+    origin_m = cloud.origin_m
+    if origin_m is not None:
+        origin_m = np.matmul(move[:3, :3], origin_m) + move[:3, 3]
+    return Cloud(cloud.lidar, points_m, cloud.time_s, origin_m)
+
+
+def _estimate(solution: Solution) -> _Estimate | None:
+    """The estimate of a place; None if it determines nothing."""
+    corrections = solution.state.corrections[1:]
+    scale = np.tile(_SCALE, len(corrections))
+    rotations = np.stack([one.rotation for one in corrections])
+    shifts = np.stack([one.position_m for one in corrections])
+    value = np.hstack([shifts, log_rotation(rotations)]).ravel() * scale
+    covariance = solution.covariance * scale[:, None] * scale
+    if not np.isfinite(covariance).all() or solution.weak.shape[1] >= len(value):
+        return None
+    covariance = (covariance + covariance.T) / 2
+    covariance = covariance + _UNKNOWN_M2 * np.matmul(solution.weak, solution.weak.T)
+    return _Estimate(value, covariance, np.linalg.inv(covariance))
+
+
+def _joined(estimates: Sequence[_Estimate]) -> _Estimate | None:
+    """The weighted mean of the estimates of all places; None without."""
+    if not estimates:
+        return None
+    information = np.sum([one.information for one in estimates], axis=0)
+    covariance = np.linalg.inv(information)
+    weighted = np.sum([np.matmul(one.information, one.value) for one in estimates], axis=0)
+    value = np.matmul(covariance, weighted)
+    spare = len(value) * (len(estimates) - 1)
+    squares = sum(
+        float((one.value - value) @ one.information @ (one.value - value)) for one in estimates
+    )
+    birge = max(1.0, squares / spare) if spare else 1.0
+    return _Estimate(value, covariance * birge, information / birge)
+
+
+def _projected(matrix: F64Array, covariance: F64Array) -> F64Array:
+    found: F64Array = np.matmul(np.matmul(matrix, covariance), matrix.T)
+    return found
+
+
+def _seems_off(estimate: _Estimate) -> bool:
+    """Whether a linear estimate is near a limit, or beyond."""
+    variance, axes = np.linalg.eigh(estimate.covariance)
+    along = np.abs(np.matmul(axes.T, estimate.value))
+    return bool((along > np.maximum(LIMIT_M / 2, 3 * np.sqrt(variance))).any())
+
+
+def _axis_name(direction: F64Array) -> str:
+    """A direction in the body frame in words."""
+    axis = int(np.abs(direction).argmax())
+    if abs(direction[axis]) >= _ALONG_AXIS:
+        return "xyz"[axis]
+    x, y, z = direction * np.sign(direction[axis])
+    return f"({x:.2f}, {y:.2f}, {z:.2f})"
