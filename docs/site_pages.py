@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 from typer.main import get_command
 
 from mlbatch.cli.app import COMMANDS, command_line
+from mlbatch.cli.help import HELP_ALL
 from mlbatch.page.findings import REMEDIES
 
 if TYPE_CHECKING:
@@ -75,7 +76,7 @@ def options_page() -> str:
     ]
     for name in COMMANDS:
         command = commands[name]
-        context = command.make_context(name, [], resilient_parsing=True)
+        context = command.make_context(name, [HELP_ALL], resilient_parsing=True)
         usage = " ".join(["mlbatch", name, *command.collect_usage_pieces(context)])
         help_rows = HelpRows()
         command.format_options(context, help_rows)

@@ -82,6 +82,11 @@ class Command(TyperCommand):
         except UsageError as err:
             raise rig_options.located(err, places) from err
 
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """Note whether all options are to be shown."""
+        ctx.meta[help_page.HELP_ALL] = help_page.HELP_ALL in args
+        return super().parse_args(ctx, args)
+
     def get_help(self, ctx: Any) -> str:
         """Options in groups; on a terminal drawn by rich."""
         if not help_page.is_drawn():
@@ -104,7 +109,7 @@ def command_line(first: str = "") -> typer.Typer:
         name="mlbatch",
         help="Time-consistent merged scans from raw packets of many lidars, offline.",
         cls=Group,
-        context_settings={"help_option_names": ["-h", "--help"]},
+        context_settings={"help_option_names": [*HELP]},
         rich_markup_mode=None,
         pretty_exceptions_enable=False,
     )
@@ -115,7 +120,8 @@ def command_line(first: str = "") -> typer.Typer:
         function = getattr(module, word)
         # The page of the root shows no options of commands: describing them takes time.
         described = _summary(function) if first in HELP else function
-        app.command(name, cls=Command)(described)
+        words = [*HELP, help_page.HELP_ALL] if name in help_page.COMMON else [*HELP]
+        app.command(name, cls=Command, context_settings={"help_option_names": words})(described)
     return app
 
 

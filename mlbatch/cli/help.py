@@ -31,6 +31,23 @@ _GROUP_OF = {
     **{option.name: option.group for option in options.CONVERT},
 }
 _PLACES = {name: at for at, name in enumerate((*options.BY_NAME, *_OTHERS))} | {"recordings": -1}
+# What `-h` of a command with many options shows; HELP_ALL shows the others, too.
+COMMON: Mapping[str, frozenset[str]] = {
+    "convert": frozenset(
+        {
+            *("recordings", "rig", "metadata", "rate", "deskew"),
+            *("only", "start", "end", "min_range", "exclude_box", "output", "format"),
+            *("html", "overwrite", "dry_run", "resume", "fail_on", "quiet"),
+        }
+    ),
+    "batch": frozenset(
+        {
+            *("sources", "output", "rig", "workers", "jobs", "part", "only", "plan", "retries"),
+            *("retry_failed", "scheduler", "rate", "format", "fail_on", "quiet"),
+        }
+    ),
+}
+HELP_ALL = "--help-all"
 # Commands with few options have no groups.
 GROUPED = ("convert", "inspect", "compare")
 
@@ -38,12 +55,20 @@ GROUPED = ("convert", "inspect", "compare")
 def groups_of(command: Any, context: Any) -> dict[str, Rows]:
     """Rows of help by group, both in the order of the table of options."""
     found: dict[str, list[tuple[int, tuple[str, str]]]] = {}
+    shown = None if context.meta.get(HELP_ALL) else COMMON.get(command.name)
     for param in command.get_params(context):
+        # The names of this option are a set: which of them is its name changes.
+        is_help = param.name.startswith("help")
+        if shown is not None and not is_help and param.name.rstrip("_") not in shown:
+            continue
         record = param.get_help_record(context)
+        if is_help and command.name in COMMON:
+            record = ("-h, --help", f"Show this page; {HELP_ALL}: every option.")
         if record is not None:
             is_grouped = command.name in GROUPED
-            place = _PLACES.get(param.name.rstrip("_"), len(_PLACES)) if is_grouped else 0
-            found.setdefault(_group(command.name, param), []).append((place, record))
+            name = "help" if is_help else param.name.rstrip("_")
+            place = _PLACES.get(name, len(_PLACES)) if is_grouped else 0
+            found.setdefault(_group(command.name, name, param), []).append((place, record))
     order = [ARGUMENTS, *options.GROUPS, OTHER]
     titles = sorted(found, key=lambda group: order.index(group) if group in order else len(order))
     return {
@@ -52,11 +77,11 @@ def groups_of(command: Any, context: Any) -> dict[str, Rows]:
     }
 
 
-def _group(command: str, param: Any) -> str:
+def _group(command: str, name: str, param: Any) -> str:
     given = getattr(param, "rich_help_panel", None)
     if given or command not in GROUPED:
         return given or (ARGUMENTS if param.param_type_name == "argument" else OTHER)
-    return _GROUP_OF.get(param.name.rstrip("_"), OTHER)
+    return _GROUP_OF.get(name, OTHER)
 
 
 def command_rows(group: Any, context: Any) -> Rows:

@@ -10,6 +10,7 @@ from typer.main import get_command
 from typer.testing import CliRunner
 
 from mlbatch.cli.app import COMMANDS, command_line
+from mlbatch.cli.help import COMMON
 from tests.contract.tree import run_python
 
 # The options of this version.
@@ -58,9 +59,14 @@ HEAVY = ("numpy", "yaml", "mcap", "zstandard", "rich.progress")
 
 def _help(*arguments: str) -> str:
     app = command_line(*arguments[:1])
-    result = CliRunner().invoke(app, [*arguments, "--help"], env={"COLUMNS": "200"})
+    result = CliRunner().invoke(app, [*arguments, _whole(*arguments)], env={"COLUMNS": "200"})
     assert result.exit_code == 0
     return " ".join(result.stdout.split())
+
+
+def _whole(command: str = "") -> str:
+    """What shows all options of a command."""
+    return "--help-all" if command in COMMON else "--help"
 
 
 def _commands(first: str = "") -> dict[str, TyperCommand]:
@@ -121,6 +127,15 @@ def test_help_shows_every_option(command: str) -> None:
         assert re.search(rf"{name}\b", page), name
 
 
+@pytest.mark.parametrize("command", COMMON)
+def test_long_commands_show_what_people_use(command: str) -> None:
+    result = CliRunner().invoke(command_line(command), [command, "-h"], env={"COLUMNS": "100"})
+    shown = set(re.findall(r"--[a-z-]+", result.stdout))
+    assert {"--output", "--rig", "--rate", "--format", "--help-all"} <= shown
+    assert shown < {*OPTIONS[command], "--help", "--help-all"}
+    assert len(result.stdout.splitlines()) <= 45
+
+
 @pytest.mark.parametrize("word", ["-h", "--help"])
 def test_both_words_show_the_same_help(word: str) -> None:
     runner = CliRunner()
@@ -139,7 +154,7 @@ GROUPS = ("Input", "Batching", "Selection", "Output", "Clocks", "Run")
 
 
 def test_every_option_of_convert_is_in_a_group() -> None:
-    page = CliRunner().invoke(command_line("convert"), ["convert", "-h"]).stdout
+    page = CliRunner().invoke(command_line("convert"), ["convert", "--help-all"]).stdout
     assert tuple(re.findall(r"^(\w+):$", page, re.MULTILINE)) == GROUPS, (
         "list the option in _OTHERS of mlbatch/cli/help.py"
     )
@@ -174,7 +189,7 @@ def test_help_fits_the_terminal(
     monkeypatch: pytest.MonkeyPatch, command: str, columns: int
 ) -> None:
     monkeypatch.setattr("mlbatch.cli.help.is_drawn", lambda: True)
-    words = [command, "-h"] if command else ["-h"]
+    words = [command, _whole(command)] if command else ["-h"]
     environment = {"COLUMNS": str(columns), "TERM": "xterm", "NO_COLOR": "1"}
     result = CliRunner().invoke(command_line(words[0]), words, env=environment)
     assert result.exit_code == 0
