@@ -50,6 +50,15 @@ def voxel_keys(points_m: F64Array, edge_m: float) -> I64Array:
     return keys
 
 
+def doubled_keys(keys: I64Array) -> I64Array:
+    """Return the numbers of the voxels of twice the edge that contain voxels (n,)."""
+    mask = 2 * _HALF - 1
+    x, y, z = keys >> 42, (keys >> 21) & mask, keys & mask
+    half = _HALF // 2
+    found: I64Array = (((x >> 1) + half) << 42) | (((y >> 1) + half) << 21) | ((z >> 1) + half)
+    return found
+
+
 def first_in_voxels(points_m: F64Array, edge_m: float) -> I64Array:
     """Return the index of the first of the points (n, 3) in each voxel, increasing."""
     return np.sort(np.unique(voxel_keys(points_m, edge_m), return_index=True)[1])

@@ -16,9 +16,9 @@ import numpy as np
 
 from mlbatch.arrays import F64Array, I64Array
 from mlbatch.motion.registration import ORIGIN, Pose
-from mlbatch.motion.se3 import exp_rotation, exp_transform
+from mlbatch.motion.se3 import exp_rotation, skew
 from mlbatch.poses.stems import Stems, stem_distances, stems
-from mlbatch.poses.surfaces import Distances, Planes, at_rows, distances, planes
+from mlbatch.poses.surfaces import Distances, Moments, Planes, distances
 
 # Cauchy kernel: residuals of this many standard deviations have half of their weight.
 _KERNEL = 2.5
@@ -85,20 +85,21 @@ class State:
 class Level:
     """How surfaces are matched: edge of cells, least cosine between normals, most distance.
 
-    points: most of a cloud that are used, about; also_m: edges of more cells.
+    points: most of a cloud that are used, about; doubled: how many sizes of cells are used besides,
+    each of twice the edge.
     """
 
     edge_m: float
     parallel: float
     most_m: float
     points: int = 1 << 40
-    also_m: tuple[float, ...] = ()
+    doubled: int = 0
 
 
 FINE = Level(0.5, 0.97, 0.15)
 LEVELS = (Level(2.0, 0.9, 1.0, 20_000), Level(1.0, 0.94, 0.4, 40_000), FINE)
 # Few beams have planes in large cells only, ground among plants in small ones only.
-_ALL_CELLS = Level(0.5, 0.97, 0.15, also_m=(0.25, 1.0, 2.0))
+_ALL_CELLS = Level(0.25, 0.97, 0.15, 60_000, 3)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -139,17 +140,23 @@ class Problem:
         self.unknowns = self.poses + 6 * len(places)
         self._stems: dict[tuple[int, int], Stems] = {}
 
-    def clouds(
-        self, place: int, state: State, edge_m: float, points: int = 1 << 40
-    ) -> list[Planes]:
+    def clouds(self, place: int, state: State, edge_m: float) -> list[Planes]:
         """Planes of the clouds of a place, moved to its instant."""
-        found: list[Planes] = []
+        return [sizes[0] for sizes in self._planes(place, state, Level(edge_m, 0.0, 0.0))]
+
+    def _planes(self, place: int, state: State, level: Level) -> list[list[Planes]]:
+        """Planes of each cloud of a place and size of cells, moved to the instant of the place."""
+        found: list[list[Planes]] = []
         for cloud in self.places[place]:
             # An odd step takes all beams in turn.
-            step = len(cloud.points_m) // points * 2 + 1 if len(cloud.points_m) > points else 1
+            step = -(-len(cloud.points_m) // level.points) | 1
             time_s = cloud.time_s[::step] + state.delay_s[cloud.lidar]
             points_m = _corrected(cloud.points_m[::step], state.corrections[cloud.lidar])
-            found.append(planes(moved(points_m, time_s, state.twists[place]), time_s, edge_m))
+            points_m = moved(points_m, time_s, state.twists[place])
+            sizes = [Moments.of_points(points_m, time_s, level.edge_m)]
+            for _ in range(level.doubled):
+                sizes.append(sizes[-1].doubled())
+            found.append([moments.planes() for moments in sizes])
         return found
 
     def stems(self, place: int, state: State) -> list[Stems | None]:
@@ -174,16 +181,13 @@ class Problem:
 
     def _place_rows(self, number: int, state: State, level: Level) -> Rows:
         place = self.places[number]
-        surfaces = [
-            self.clouds(number, state, edge_m, level.points)
-            for edge_m in (level.edge_m, *level.also_m)
-        ]
+        surfaces = self._planes(number, state, level)
         uprights = self.stems(number, state)
         parts = []
         for first, second in combinations(range(len(place)), 2):
             pair = place[first].lidar, place[second].lidar
-            for of_edge in surfaces:
-                found = distances(of_edge[first], of_edge[second], level.parallel, level.most_m)
+            for sizes in zip(surfaces[first], surfaces[second], strict=True):
+                found = distances(*sizes, level.parallel, level.most_m)
                 parts.append(self._rows(pair, found, state.twists[number]))
             one, other = uprights[first], uprights[second]
             if one is not None and other is not None:
@@ -241,13 +245,15 @@ def moved(points_m: F64Array, time_s: F64Array, twist: F64Array) -> F64Array:
     """Points (n, 3) moved by a constant twist (6,) over their times (n,)."""
     if not twist.any() or not len(points_m):
         return points_m
-    # Steps of 0.1 ms are enough for any vehicle.
-    index = np.round(time_s * 1e4).astype(np.int64)
-    least = int(index.min())
-    index -= least
-    steps = (np.arange(int(index.max()) + 1) + least) * 1e-4
-    rotation, shift = exp_transform(steps[:, None] * twist[:3], steps[:, None] * twist[3:])
-    found: F64Array = at_rows(rotation[index], points_m) + shift[index]
+    turn = skew(twist[None, 3:])[0].T
+    term = np.matmul(points_m, turn) + twist[:3]
+    term *= time_s[:, None]
+    found: F64Array = points_m + term
+    # The exponential as its series: turns of 0.3 rad leave 1e-6 of a distance.
+    for order in range(2, 6):
+        term = np.matmul(term, turn)
+        term *= time_s[:, None] / order
+        found += term
     return found
 
 
@@ -277,7 +283,7 @@ def solve(problem: Problem, state: State, level: Level, most_steps: int = 25) ->
         step = equations.step()
         state = _after(problem, state, step)
         equations = _Equations(problem, problem.rows(state, level), state)
-        if _is_small(problem, step):
+        if _is_small(problem, step, max(1.0, level.edge_m / FINE.edge_m) ** 2):
             converged = True
             break
     covariance, weak = equations.determined()
@@ -299,9 +305,10 @@ def find_poses(
     return solve(Problem(places, lidars, delays=delays), state, _ALL_CELLS)
 
 
-def _is_small(problem: Problem, step: F64Array) -> bool:
-    six = step[: problem.poses].reshape(-1, problem.each) if problem.poses else np.zeros((0, 6))
-    return bool((np.abs(six[:, :3]) < _SMALL_M).all() and (np.abs(six[:, 3:6]) < _SMALL_RAD).all())
+def _is_small(problem: Problem, step: F64Array, factor: float) -> bool:
+    six = np.abs(step[: problem.poses].reshape(-1, problem.each))
+    small = (six[:, :3] < factor * _SMALL_M).all() and (six[:, 3:6] < factor * _SMALL_RAD).all()
+    return bool(small)
 
 
 def _shortened(step: F64Array, shift: float, turn: float) -> F64Array:
@@ -400,9 +407,10 @@ class _Equations:
             jacobian, noise = part.jacobian / part.scale, part.noise / part.scale
             # Derivative of the kernel, which is below its weight.
             slope = (1.0 - off) / (1.0 + off) ** 2
-            within, bare = _product(jacobian, slope), _product(noise, slope)
-            twist = _floored(within[size:, size:] - bare[size:, size:], self._prior)
-            ratio = np.linalg.solve(twist, within[size:, :size] - bare[size:, :size])
+            # What a change of the poses does to the twist, by the weights of the steps.
+            weighted = _product(jacobian, 1.0 / (1.0 + off))
+            twist = weighted[size:, size:] + np.diag(self._prior)
+            ratio = np.linalg.solve(twist, weighted[size:, :size])
             pose = jacobian[:, :size] - np.matmul(jacobian[:, size:], ratio)
             wrong = noise[:, :size] - np.matmul(noise[:, size:], ratio)
             pose, wrong = pose * self._units, wrong * self._units
@@ -440,13 +448,4 @@ class _Equations:
 
 def _product(rows: F64Array, weight: F64Array) -> F64Array:
     found: F64Array = np.matmul((rows * weight[:, None]).T, rows)
-    return found
-
-
-def _floored(information: F64Array, prior: F64Array) -> F64Array:
-    """Information (6, 6) of a twist with its prior (6,), in no direction less than that."""
-    root = np.sqrt(prior)
-    value, axes = np.linalg.eigh(information / root[:, None] / root)
-    scaled = np.matmul(axes * (np.maximum(value, 0.0) + 1.0), axes.T)
-    found: F64Array = scaled * root[:, None] * root
     return found

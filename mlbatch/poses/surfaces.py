@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from mlbatch.arrays import BoolArray, F64Array, I64Array
-from mlbatch.motion.voxels import voxel_keys
+from mlbatch.motion.voxels import doubled_keys, voxel_keys
 
 # A cell with fewer points has no reliable plane.
 _LEAST_POINTS = 8
@@ -60,43 +60,76 @@ class Planes:
         return found
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Moments:
+    """Sums over the points of k cells: key (k,), increasing; count (k,); total (k, 10), of x, y, z,
+    their products xx, xy, xz, yy, yz, zz, and time."""
+
+    edge_m: float
+    key: I64Array
+    count: I64Array
+    total: F64Array
+
+    @classmethod
+    def of_points(cls, points_m: F64Array, time_s: F64Array, edge_m: float) -> Moments:
+        """Sums of points (n, 3) with times (n,), in cells of an edge."""
+        x, y, z = points_m.T
+        rows = np.empty((len(points_m), 10))
+        rows[:, :3] = points_m
+        rows[:, 3:6] = points_m * x[:, None]
+        rows[:, 6], rows[:, 7], rows[:, 8] = y * y, y * z, z * z
+        rows[:, 9] = time_s
+        key = voxel_keys(points_m, edge_m)
+        return cls._merged(edge_m, key, np.ones(len(key), np.int64), rows)
+
+    def doubled(self) -> Moments:
+        """The sums in cells of twice the edge."""
+        return self._merged(2 * self.edge_m, doubled_keys(self.key), self.count, self.total)
+
+    @classmethod
+    def _merged(cls, edge_m: float, key: I64Array, count: I64Array, total: F64Array) -> Moments:
+        if not len(key):
+            return cls(edge_m, key, count, total)
+        order = np.argsort(key)
+        key = key[order]
+        first = np.flatnonzero(np.concatenate([[True], key[1:] != key[:-1]]))
+        return cls(
+            edge_m,
+            key[first],
+            np.add.reduceat(count[order], first),
+            np.add.reduceat(total[order], first, axis=0),
+        )
+
+    def planes(self) -> Planes:
+        """The planes of cells that have one."""
+        enough = self.count >= _LEAST_POINTS
+        key, count = self.key[enough], self.count[enough]
+        # Products of distances to 1 km lose 0.02 mm to rounding.
+        means = self.total[enough] / count[:, None]
+        mean = means[:, :3]
+        square = means[:, [3, 4, 5, 4, 6, 7, 5, 7, 8]].reshape(-1, 3, 3)
+        variance, axes = np.linalg.eigh(square - mean[:, :, None] * mean[:, None, :])
+        variance = np.maximum(variance, 0.0)
+        across, along, _ = variance.T
+        is_plane = along >= (_LEAST_SPREAD * self.edge_m) ** 2
+        is_plane &= across <= np.minimum(_FLAT * along, _MOST_THICK_M**2)
+        variance, axes, count = variance[is_plane], axes[is_plane], count[is_plane]
+        noise = np.maximum(variance[:, 0], _FLOOR_M**2) / (count - 3)
+        # Of the tilt about each axis along the plane: noise by the spread of the points on it.
+        tilt = axes[:, :, 1:] * np.sqrt(noise[:, None] / variance[:, 1:])[:, None, :]
+        return Planes(
+            key[is_plane],
+            mean[is_plane],
+            means[is_plane, 9],
+            np.ascontiguousarray(axes[:, :, 0]),
+            noise + _FLOOR_M**2,
+            np.matmul(tilt, tilt.transpose(0, 2, 1)),
+        )
+
+
 def planes(points_m: F64Array, time_s: F64Array, edge_m: float) -> Planes:
     """Planes of points (n, 3) with times (n,), in cells of an edge."""
-    key = voxel_keys(points_m, edge_m)
-    order = np.argsort(key, kind="stable")
-    key = key[order]
-    first = np.flatnonzero(np.concatenate([np.ones(min(1, len(key)), bool), key[1:] != key[:-1]]))
-    count = np.diff(first, append=len(key))
-    enough = count >= _LEAST_POINTS
-    kept = np.repeat(enough, count)
-    points_m, time_s = points_m[order[kept]], time_s[order[kept]]
-    key, count = key[first[enough]], count[enough]
-    if not len(key):
-        return Planes(key, *(np.zeros((0, *shape)) for shape in ((3,), (), (3,), (), (3, 3))))
-    start = np.cumsum(count) - count
-    base_m = points_m[start]
-    local = points_m - np.repeat(base_m, count, axis=0)
-    x, y, z = local.T
-    rows = np.stack([x, y, z, x * x, x * y, x * z, y * y, y * z, z * z, time_s], axis=1)
-    means = np.add.reduceat(rows, start, axis=0) / count[:, None]
-    mean = means[:, :3]
-    square = means[:, [3, 4, 5, 4, 6, 7, 5, 7, 8]].reshape(-1, 3, 3)
-    variance, axes = np.linalg.eigh(square - mean[:, :, None] * mean[:, None, :])
-    across, along, _ = np.maximum(variance, 0.0).T
-    is_plane = along >= (_LEAST_SPREAD * edge_m) ** 2
-    is_plane &= across <= np.minimum(_FLAT * along, _MOST_THICK_M**2)
-    variance, axes, count = variance[is_plane], axes[is_plane], count[is_plane]
-    noise = np.maximum(variance[:, 0], _FLOOR_M**2) / (count - 3)
-    # Of the tilt about each axis along the plane: noise by the spread of the points on it.
-    tilt = axes[:, :, 1:] * np.sqrt(noise[:, None] / variance[:, 1:])[:, None, :]
-    return Planes(
-        key[is_plane],
-        (base_m + mean)[is_plane],
-        means[is_plane, 9],
-        np.ascontiguousarray(axes[:, :, 0]),
-        noise + _FLOOR_M**2,
-        np.matmul(tilt, tilt.transpose(0, 2, 1)),
-    )
+    return Moments.of_points(points_m, time_s, edge_m).planes()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -118,12 +151,6 @@ class Distances:
 
     def __len__(self) -> int:
         return len(self.key)
-
-
-def at_rows(rotations: F64Array, vectors: F64Array) -> F64Array:
-    """Rotations (n, 3, 3) of vectors (n, 3), each of its own."""
-    turned: F64Array = np.einsum("nij,nj->ni", rotations, vectors)
-    return turned
 
 
 def shared_cells(first: Planes, second: Planes) -> tuple[I64Array, I64Array]:
