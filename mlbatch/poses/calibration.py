@@ -469,7 +469,7 @@ def _axis(vector: F64Array) -> str:
 
 def _record_instead(directions: Sequence[str]) -> str:
     """What to record so that directions are fixed."""
-    wanted = {
+    needed = {
         "a shift along z": "a floor that both see",
         "a shift": "a corner, a wall across, a stop at a junction",
         "a turn about z": "walls or trunks some metres away",
@@ -477,7 +477,7 @@ def _record_instead(directions: Sequence[str]) -> str:
         "its delay": "turns of the machine while it is near walls",
     }
     found = dict.fromkeys(
-        next(what for key, what in wanted.items() if f": {key}" in direction)
+        next(what for key, what in needed.items() if f": {key}" in direction)
         for direction in directions
     )
     return f"also record {', and '.join(found)}, seen by both lidars at the same time"
