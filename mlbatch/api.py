@@ -115,6 +115,7 @@ def calibrate(
     metadata: Paths = (),
     only: Names = (),
     clock: str = "sensor",
+    align_clocks: bool = False,
     start: Moment | None = None,
     end: Moment | None = None,
     time_offset: bool = False,
@@ -128,7 +129,14 @@ def calibrate(
     """
     (guess,) = paths_of("rig", rig)
     job = calibrate_job(
-        recordings, guess, metadata=metadata, only=only, clock=clock, start=start, end=end
+        recordings,
+        guess,
+        metadata=metadata,
+        only=only,
+        clock=clock,
+        align_clocks=align_clocks,
+        start=start,
+        end=end,
     )
     return run_calibration(
         job,

@@ -36,6 +36,7 @@ LONG = (
     "simulate/",
     "verification/",
     "batching/test_reference.py",
+    "cli/test_calibrate.py",
     "cli/test_deskew.py",
     "cli/test_fusion.py",
     "cli/test_progress.py",

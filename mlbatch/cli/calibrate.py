@@ -53,6 +53,9 @@ def calibrate(
             CLOCKS, "--clock", help="sensor: timestamps of the packets; host: their receive times."
         ),
     ] = "sensor",
+    align_clocks: Annotated[
+        bool, typer.Option("--align-clocks", help="Align clocks that are not synchronised.")
+    ] = False,
     start: Annotated[
         str | None,
         typer.Option(help="First time: ISO, epoch seconds, +S from the start.", metavar="TIME"),
@@ -92,6 +95,7 @@ def calibrate(
         metadata=tuple(metadata or ()),
         only=tuple(only or ()),
         clock=clock,
+        align_clocks=align_clocks,
         start=start,
         end=end,
         shown=long_name,

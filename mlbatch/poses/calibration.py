@@ -19,7 +19,17 @@ from mlbatch.frames.transforms import from_rpy_deg, rpy_deg
 from mlbatch.motion.registration import Pose
 from mlbatch.motion.se3 import log_rotation, skew
 from mlbatch.poses.places import Places
-from mlbatch.poses.solve import Cloud, Place, Problem, Solution, State, find_poses, moved
+from mlbatch.poses.solve import (
+    LEVELS,
+    Cloud,
+    Place,
+    Problem,
+    Solution,
+    State,
+    find_poses,
+    moved,
+    solve,
+)
 from mlbatch.poses.surfaces import distances, shared_cells
 from mlbatch.units import MM_PER_M, RAD_PER_DEG
 
@@ -40,8 +50,12 @@ _MOST_APART_M = 0.015
 _MOST_APART_DEG = 0.1
 # A turn of 1 rad counts as this far in `Solution.weak`, m.
 _LEVER_M = 10.0
+# An axis of the body is open if this share of it is.
+_IN_DIRECTIONS = 0.5
 # A delay is known if its standard deviation is below, s.
 _MOST_DELAY_SIGMA_S = 0.002
+# Shorter delays do not move poses by more than they may be off, s.
+_LEAST_DELAY_S = 0.002
 # Digits of poses that are written: micrometres, and degrees.
 _DIGITS = 6
 _MS_PER_S = 1000.0
@@ -221,8 +235,9 @@ def calibrated(
     found = find_poses(fitted, len(names), delays=delays, guess=begin)
     _refuse_unseen(found, names)
     _refuse_undetermined(found, names, delays=delays)
-    lidars = _lidar_poses(found, names, poses, 1.0, delays=delays)
-    _refuse_far(lidars)
+    if not delays:
+        _refuse_late(fitted, found, names)
+    _refuse_far(_lidar_poses(found, names, poses, 1.0, delays=delays))
     again = find_poses(held_out, len(names), guess=_start(found.state, len(held_out)))
     twists = again.state.twists
     start = State.start(len(names), len(held_out))
@@ -427,21 +442,46 @@ def _refuse_unseen(found: Solution, names: Sequence[str]) -> None:
             )
 
 
+def _refuse_late(places: Sequence[Place], found: Solution, names: Sequence[str]) -> None:
+    """Refuse poses that make up for timestamps that are late."""
+    late = solve(Problem(places, len(names), delays=True), found.state, LEVELS[-1])
+    sigma_s = np.sqrt(np.diag(late.covariance))[6::7]
+    for name, delay, sigma in zip(
+        names[1:], late.state.delay_s[1:].tolist(), sigma_s.tolist(), strict=True
+    ):
+        if sigma < _MOST_DELAY_SIGMA_S and abs(delay) > max(_LEAST_DELAY_S, 5.0 * sigma):
+            raise _refused(
+                f"timestamps of {name} that agree with those of {names[0]}",
+                f"a delay of {-_MS_PER_S * delay:.1f} ms (+- {_MS_PER_S * sigma:.1f}), which poses "
+                "without it would hide",
+                "give --time-offset",
+            )
+
+
 def _refuse_undetermined(found: Solution, names: Sequence[str], *, delays: bool) -> None:
     each = 7 if delays else 6
-    directions = dict.fromkeys(_direction(axis, names, each) for axis in found.weak.T)
+    directions = _open_directions(found.weak, names, each)
     if delays:
         sigma_s = np.sqrt(np.diag(found.covariance))[6::7]
         for name, sigma in zip(names[1:], sigma_s.tolist(), strict=True):
-            if sigma > _MOST_DELAY_SIGMA_S:
-                directions[f"{name}: its delay"] = None
-    if not directions:
-        return
-    raise _refused(
-        "surfaces that fix the poses in every direction",
-        f"none that fix {'; '.join(directions)}",
-        _record_instead(list(directions)),
-    )
+            if sigma > _MOST_DELAY_SIGMA_S and f"{name}: its delay" not in directions:
+                directions.append(f"{name}: its delay")
+    if directions:
+        raise _refused(
+            "surfaces that fix the poses in every direction",
+            f"none that fix {'; '.join(directions)}",
+            _record_instead(directions),
+        )
+
+
+def _open_directions(weak: F64Array, names: Sequence[str], each: int) -> list[str]:
+    """What directions of the poses (u, w) move, in words: by axes of the body, if they can be."""
+    # How much of each axis lies in the directions.
+    share = (weak**2).sum(axis=1)
+    axes = np.eye(len(weak))[share > _IN_DIRECTIONS]
+    if len(axes) < weak.shape[1]:
+        axes = weak.T
+    return list(dict.fromkeys(_direction(axis, names, each) for axis in axes))
 
 
 def _direction(axis: F64Array, names: Sequence[str], each: int) -> str:

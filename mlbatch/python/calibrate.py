@@ -8,13 +8,20 @@ from dataclasses import replace
 from datetime import date
 from pathlib import Path
 
-from mlbatch.errors import ExportError, UsageError
+from mlbatch.errors import ExportError, NoScanError, RigError, UsageError
 from mlbatch.pipeline.conversion import Conversion, Progress
 from mlbatch.pipeline.job import Job
-from mlbatch.poses.calibration import Calibration, LidarPose, calibrated, numbers
-from mlbatch.poses.places import LEAST_RANGE_M, MOST_RANGE_M, places_of
+from mlbatch.poses.calibration import (
+    MOST_OFF_DEG,
+    MOST_OFF_M,
+    Calibration,
+    LidarPose,
+    calibrated,
+    numbers,
+)
+from mlbatch.poses.places import LEAST_RANGE_M, MOST_RANGE_M, Places, places_of
 from mlbatch.python.options import Moment, Names, Paths, session_job, window_job
-from mlbatch.rig.rig import Rig, RigSensor, read_rig
+from mlbatch.rig.rig import Rig, RigSensor, UnknownExtrinsics, read_rig
 from mlbatch.rig.write import write_rig
 from mlbatch.types import Scan
 from mlbatch.units import NS_PER_MS
@@ -30,23 +37,48 @@ def calibrate_job(
     *,
     metadata: Paths = (),
     clock: str = "sensor",
+    align_clocks: bool = False,
     only: Names = (),
     start: Moment | None = None,
     end: Moment | None = None,
     shown: Callable[[str], str] = str,
 ) -> Job:
     """The job whose scans a calibration reads; shown: the name of an option in errors."""
+    _refuse_unknown(rig)
     session = session_job(
-        recordings, {"rig": rig, "metadata": metadata, "clock": clock, "only": only}, shown
+        recordings,
+        {
+            "rig": rig,
+            "metadata": metadata,
+            "clock": clock,
+            "align_clocks": align_clocks,
+            "only": only,
+        },
+        shown,
     )
     job = window_job(session, {"rate": _RATE, "start": start, "end": end}, shown)
     return replace(job, min_range_m=LEAST_RANGE_M, max_range_m=MOST_RANGE_M)
+
+
+def _refuse_unknown(rig: Path) -> None:
+    for sensor in read_rig(rig).sensors:
+        if isinstance(sensor.extrinsics, UnknownExtrinsics):
+            raise RigError(
+                f"{sensor.extrinsics.place}: expected a guess of the pose of {sensor.name}, within "
+                f"{MOST_OFF_DEG:g} degrees and {MOST_OFF_M:g} m, found unknown; give translation_m "
+                "and rotation_rpy_deg as a tape measure shows them"
+            )
 
 
 def calibrate(
     job: Job, *, time_offset: bool = False, progress: Progress | None = None
 ) -> Calibration:
     """Refine the poses of the rig of a job; MlbatchError where they are not determined."""
+    if time_offset and job.align_clocks_to:
+        raise UsageError(
+            "--time-offset: expected clocks as recorded, whose offsets a rig can keep, found "
+            "--align-clocks, which aligns them anew in each run; leave one out"
+        )
     run = Conversion(job)
     names = [sensor.name for sensor in run.sensors]
     if len(names) < 2:
@@ -55,8 +87,12 @@ def calibrate(
             "of all, and a rig with all of them"
         )
     poses = [sensor.pose.body_from_sensor for sensor in run.session.setup.sensors]
-    with contextlib.closing(_scans(run, progress)) as scans:
-        places = places_of(scans, len(names))
+    try:
+        with contextlib.closing(_scans(run, progress)) as scans:
+            places = places_of(scans, len(names))
+    except NoScanError:
+        # Its remedies are for outputs.
+        places = Places([], 0, 0, [0] * len(names))
     return calibrated(places, names, poses, delays=time_offset)
 
 

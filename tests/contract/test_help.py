@@ -42,7 +42,8 @@ OPTIONS: dict[str, set[str]] = {
         "simulate": "output duration seed overwrite quiet",
         "schema": "",
         "calibrate": """
-            rig output metadata only clock start end time-offset html overwrite json verbose
+            rig output metadata only clock align-clocks start end time-offset html overwrite
+            json verbose
         """,
         "digest": "output against overwrite",
         "diff": "tolerance json",
