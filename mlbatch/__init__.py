@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from mlbatch.api import calibrate as calibrate
     from mlbatch.api import convert as convert
+    from mlbatch.api import extract as extract
     from mlbatch.api import inspect as inspect
     from mlbatch.api import open as open
     from mlbatch.api import read as read
@@ -29,6 +30,7 @@ __all__ = [
     "calibrate",
     "convert",
     "digest",
+    "extract",
     "inspect",
     "open",
     "read",
@@ -44,7 +46,9 @@ _PLACES = {
     "Scan": "mlbatch.outputs.scan",
     "digest": "mlbatch.digests",
     "verify": "mlbatch.verification",
-    **dict.fromkeys(("calibrate", "convert", "inspect", "open", "read", "scans"), "mlbatch.api"),
+    **dict.fromkeys(
+        ("calibrate", "convert", "extract", "inspect", "open", "read", "scans"), "mlbatch.api"
+    ),
 }
 
 

@@ -13,12 +13,15 @@ from mlbatch.outputs.scan import Scan
 from mlbatch.page import check_page, write_text_page
 from mlbatch.page.calibration import calibration_page
 from mlbatch.pipeline.conversion import Progress
+from mlbatch.pipeline.extract import Extracted
+from mlbatch.pipeline.extract import extract as extract_packets
 from mlbatch.pipeline.inspect import Inspection
 from mlbatch.pipeline.inspect import inspect as inspect_recordings
 from mlbatch.pipeline.job import Job
 from mlbatch.poses.calibration import Calibration
 from mlbatch.python.calibrate import calibrate as calibrate_rig
 from mlbatch.python.calibrate import calibrate_job, check_output, rig_text
+from mlbatch.python.extract import ExtractOptions, extraction
 from mlbatch.python.options import (
     AnyPath,
     ConvertOptions,
@@ -87,6 +90,17 @@ def convert(
     else:
         job = session_job(recording, options)
     return run_job(window_job(job, options), path_of("output", output), options)
+
+
+@documented(ExtractOptions)
+def extract(recordings: Paths, output: AnyPath, **options: Unpack[ExtractOptions]) -> Extracted:
+    """Write raw packets into another recording, as `mlbatch extract` does, with its options.
+
+    start, end: int ns or texts, by receive time; duration: s; copy_topics: as `--pass`. Raises
+    MlbatchError where the command ends with an error.
+    """
+    check_names("mlbatch.extract", options, ExtractOptions)
+    return extract_packets(extraction(recordings, output, options))
 
 
 def read(output: AnyPath) -> Iterator[Scan]:

@@ -18,7 +18,7 @@ _PATH_TYPES = ("path", "file", "directory")
 # Modules of this package, each with a function of the same name, in the order of `--help`.
 COMMANDS = (
     *("convert", "merge", "batch", "batch-status", "inspect", "compare", "sensors", "verify"),
-    *("report", "calibrate", "digest", "diff", "simulate", "schema"),
+    *("report", "calibrate", "digest", "diff", "extract", "simulate", "schema"),
 )
 
 

@@ -126,13 +126,14 @@ def subscribe(recordings: Iterable[Recording]) -> None:
 class MetadataCollector:
     """Collects calibrations and extrinsics from messages.
 
-    extrinsics: transforms and robot descriptions; faults: why messages could not be read.
+    extrinsics: transforms and robot descriptions; faults: why messages could not be read;
+    calibration_texts: by topic.
     """
 
     def __init__(self) -> None:
         self.extrinsics = ExtrinsicsSources()
         self.faults: list[str] = []
-        self._calibration_texts: dict[str, bytes] = {}
+        self.calibration_texts: dict[str, bytes] = {}
 
     def add(self, batch: PacketBatch) -> None:
         """Add the messages of a batch; each fault is noted once."""
@@ -164,17 +165,17 @@ class MetadataCollector:
 
     def _add_text(self, topic: Topic, text: bytes) -> None:
         """Keep the first text of a topic: the settings at the start of the recording."""
-        self._calibration_texts.setdefault(topic.name, text)
+        self.calibration_texts.setdefault(topic.name, text)
 
     @property
     def calibration_topics(self) -> tuple[str, ...]:
         """Topics with a text that should be a calibration."""
-        return tuple(self._calibration_texts)
+        return tuple(self.calibration_texts)
 
     def calibrations(self) -> list[Calibration]:
         """Calibrations in messages; a text that is none is noted as a fault."""
         found: list[Calibration] = []
-        for topic, text in self._calibration_texts.items():
+        for topic, text in self.calibration_texts.items():
             try:
                 calibration = sensors.parse_calibration(Path(topic), text)
             except MlbatchError as err:

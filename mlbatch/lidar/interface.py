@@ -32,6 +32,24 @@ class SensorModel(NamedTuple):
     same_packets_as: str = ""
 
 
+class Recorded(NamedTuple):
+    """How the packets of a vendor are recorded where nothing else is known.
+
+    port, imu_port, device_port: default destinations of lidar, IMU and other packets; topic,
+    imu_topic: last parts of topics ("": as for the lidar); message, message_ros1: types of its
+    drivers, package/Type; device_magic: first bytes of packets that describe the device.
+    """
+
+    port: int
+    topic: str
+    message: str
+    message_ros1: str
+    imu_port: int = 0
+    imu_topic: str = ""
+    device_port: int = 0
+    device_magic: bytes = b""
+
+
 class NeighbourStream(NamedTuple):
     """Packets of another stream with the same source IP or topic namespace; as `Evidence`.
 
@@ -210,7 +228,8 @@ class Lidar(Protocol):
     reader: HeaderReader | None
     # The sequence number wraps there; 0: packets have none.
     sequence_modulus: int
-    # Destination port of IMU packets; 0: unknown.
+    # Destination ports of its packets and of IMU packets by its settings; 0: unknown.
+    lidar_port: int
     imu_port: int
     # By return; numbers of docs/sources/outputs.md section 3.
     return_types: tuple[int, ...]

@@ -52,6 +52,15 @@ def paths_of(what: str, values: Paths) -> tuple[Path, ...]:
     return tuple(_path(what, value) for value in values)
 
 
+def recordings_of(recordings: Paths | tuple[Paths, ...]) -> tuple[Path, ...]:
+    """The recordings of a session, at least one; patterns and folders are expanded."""
+    several = recordings if isinstance(recordings, tuple) else (recordings,)
+    found = expand(path for one in several for path in paths_of("recording", one))
+    if not found:
+        raise UsageError("recording: expected at least one path, found none; name a recording")
+    return found
+
+
 def path_of(what: str, value: AnyPath | None) -> Path | None:
     """A path, or None."""
     return None if value is None else _path(what, value)
@@ -204,12 +213,8 @@ def session_job(
     clock = choice(shown("clock"), options.get("clock", "sensor"), CLOCKS)
     align_to = choice(shown("align_to"), options.get("align_to", "host"), ALIGN_TO)
     aligned = options.get("align_clocks", False)
-    several = recordings if isinstance(recordings, tuple) else (recordings,)
-    found = expand(path for one in several for path in paths_of("recording", one))
-    if not found:
-        raise UsageError("recording: expected at least one path, found none; name a recording")
     return Job(
-        recordings=found,
+        recordings=recordings_of(recordings),
         selection=SensorSelection(
             rig=path_of("rig", options.get("rig")),
             metadata=paths_of("metadata", options.get("metadata", ())),

@@ -39,6 +39,7 @@ _ALIASES = {
     "builtin_interfaces/Duration": "duration",
     "Header": "std_msgs/Header",
 }
+_TIMES = re.compile(r"^(builtin_interfaces/\w+) ", re.MULTILINE)
 _RULE = re.compile(r"^=+[ \t]*\r?$", re.MULTILINE)
 _FIELD = re.compile(r"^([\w/]+)(?:<=\d+)?(\[(?:<=)?\d*\])?\s+(\w+)\s*(=?)", re.ASCII)
 _BREAK = "=" * 80
@@ -217,10 +218,10 @@ def definition(name: str) -> str:
     return _with_dependencies(name, _depth_first(name, [])[1:], _table())
 
 
-def definition_text(type_name: str) -> str:
+def definition_text(type_name: str, encoding: str = "cdr") -> str:
     """The table's definition of a recorded type, followed by all it consists of (breadth first).
 
-    Without constants; "" for types that are not in the table.
+    Without constants; "" for types that are not in the table. encoding: `ros1` for that of ROS 1.
     """
     root = type_key(type_name)
     table = _table()
@@ -233,7 +234,16 @@ def definition_text(type_name: str) -> str:
         name: "\n".join(line for line in table[name].splitlines() if "=" not in line)
         for name in needed
     }
+    if encoding == "ros1":
+        # There a time is a built-in type.
+        needed = [name for name in needed if name not in _ALIASES]
+        plain = {name: _TIMES.sub(_ros1_time, text) for name, text in plain.items()}
+        plain["std_msgs/Header"] = _ROS1_HEADER
     return _with_dependencies(root, needed[1:], plain)
+
+
+def _ros1_time(match: re.Match[str]) -> str:
+    return f"{_ALIASES[match[1]]} "
 
 
 def _with_dependencies(root: str, others: list[str], texts: Mapping[str, str]) -> str:

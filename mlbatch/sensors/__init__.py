@@ -22,7 +22,7 @@ from mlbatch.arrays import U8Array
 from mlbatch.bounded import read_bytes
 from mlbatch.errors import RigError
 from mlbatch.lidar.headers import content_keys
-from mlbatch.lidar.interface import Calibration, SensorModel
+from mlbatch.lidar.interface import Calibration, Recorded, SensorModel
 from mlbatch.sensors.options import DECODE_OPTIONS
 
 __all__ = [
@@ -37,6 +37,7 @@ __all__ = [
     "parse_calibration",
     "plugins",
     "read_calibration",
+    "recorded",
     "senders",
     "vendor_of",
 ]
@@ -64,6 +65,8 @@ class Plugin(Protocol):
     MODELS: tuple[SensorModel, ...]
     # Calibrations without a file: models whose beams do not differ from unit to unit.
     BUILT_IN: tuple[Calibration, ...]
+
+    # Optional: `RECORDED`, of type `Recorded`; without it packets are not extracted to bags.
 
     def read_calibration(self, path: Path, content: bytes) -> Calibration | None:
         """Parse a calibration file; None if it is another vendor's, RigError if it is damaged."""
@@ -159,3 +162,11 @@ def describe(size: int, sample: U8Array) -> str | None:
     """Name payloads (k, size) of an unknown stream; None if no vendor knows them."""
     texts = (plugin.describe(size, sample) for plugin in _load_lazily(senders(size, sample)))
     return next((text for text in texts if text is not None), None)
+
+
+def recorded(size: int, sample: U8Array) -> Recorded | None:
+    """How drivers of the vendor that knows payloads (k, size) record them; None if not known."""
+    for plugin in _load_lazily(senders(size, sample)):
+        if plugin.describe(size, sample) is not None:
+            return cast("Recorded | None", getattr(plugin, "RECORDED", None))
+    return None

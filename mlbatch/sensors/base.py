@@ -41,6 +41,7 @@ class BaseLidar:
     sequence_modulus: int = 0
     column_period_ns: float = 0.0
     lit_share: float | None = None
+    lidar_port: int = 0
     imu_port: int = 0
     typed_by: str = "level"
     sends_twice: bool = True

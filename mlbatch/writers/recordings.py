@@ -36,6 +36,8 @@ ROSBAG1 = ".bag"
 ENCODINGS = {PCAP: (), MCAP: ("cdr", "ros1"), SQLITE: ("cdr",), ROSBAG1: ("ros1",)}
 # Of one datagram in a frame: the length of an IP packet has 16 bits.
 MOST_UDP_BYTES = 65535 - IP.__hdr_len__ - UDP.__hdr_len__
+# Seconds of a record have 32 bits.
+MOST_HOST_NS = 2**32 * NS_PER_S
 
 # Destinations: recordings do not tell them.
 _RECEIVERS = {4: ipaddress.IPv4Address("10.5.5.1").packed, 6: ipaddress.IPv6Address("::1").packed}

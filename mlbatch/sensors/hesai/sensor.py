@@ -17,7 +17,7 @@ from mlbatch.arrays import F64Array, median
 from mlbatch.errors import RigError
 from mlbatch.lidar.geometry import BeamTable, Projection, spherical
 from mlbatch.lidar.headers import HeaderReader
-from mlbatch.lidar.interface import Calibration, Evidence, SensorModel
+from mlbatch.lidar.interface import Calibration, Evidence, Recorded, SensorModel
 from mlbatch.sensors.base import BaseLidar
 from mlbatch.sensors.hesai import models as rows
 from mlbatch.sensors.hesai.angles import At128File, HesaiAngles, read_angles, read_at128
@@ -40,6 +40,14 @@ from mlbatch.units import M_PER_MM, RAD_PER_DEG
 __all__ = ["BUILT_IN", "MODELS", "VENDOR", "HesaiCalibration", "HesaiLidar", "describe"]
 
 VENDOR = "HESAI"
+# Default ports: docs/sources/messages.md, section 7; topics and messages: section 1.
+RECORDED = Recorded(
+    port=2368,
+    topic="hesai_packets",
+    message="hesai_ros_driver/UdpFrame",
+    message_ros1="hesai_ros_driver/UdpFrame",
+    device_port=10110,
+)
 BUILT_IN: tuple[Calibration, ...] = ()
 _CSV = "angle csv of the unit, required"
 _DAT = "correction dat of the unit, required"

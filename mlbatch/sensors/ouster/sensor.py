@@ -16,7 +16,7 @@ from mlbatch.arrays import F64Array, I64Array, U8Array, rows_of
 from mlbatch.errors import RigError
 from mlbatch.lidar.geometry import BeamTable
 from mlbatch.lidar.headers import HeaderReader
-from mlbatch.lidar.interface import Calibration, Evidence, Records, SensorModel
+from mlbatch.lidar.interface import Calibration, Evidence, Recorded, Records, SensorModel
 from mlbatch.sensors.base import BaseLidar
 from mlbatch.sensors.options import check_options
 from mlbatch.sensors.ouster.identify import describe
@@ -46,6 +46,16 @@ __all__ = [
 ]
 
 VENDOR = "Ouster"
+# Default ports: docs/sources/messages.md, section 7; topics and messages: section 1.
+RECORDED = Recorded(
+    port=7502,
+    topic="lidar_packets",
+    message="ouster_sensor_msgs/PacketMsg",
+    message_ros1="ouster_ros/PacketMsg",
+    imu_port=7503,
+    imu_topic="imu_packets",
+    device_port=7502,
+)
 _REAL = frozenset({"OS0-32", "OS0-128", "OS1-32", "OS1-64", "OS1-128", "OS2-32", "OS2-128"})
 _BEAMS = {
     "OS0": (32, 64, 128),

@@ -18,7 +18,7 @@ from mlbatch.arrays import U8Array
 from mlbatch.errors import RigError
 from mlbatch.lidar.geometry import BeamTable, spherical
 from mlbatch.lidar.headers import HeaderReader
-from mlbatch.lidar.interface import NAMED_ONLY, Calibration, Evidence, SensorModel
+from mlbatch.lidar.interface import NAMED_ONLY, Calibration, Evidence, Recorded, SensorModel
 from mlbatch.sensors.base import BaseLidar
 from mlbatch.sensors.nominal import refuse_other_beams
 from mlbatch.sensors.options import check_options
@@ -44,7 +44,7 @@ from mlbatch.sensors.robosense.identify import (
     fits,
     point_packets,
 )
-from mlbatch.sensors.robosense.models import FIRST_LAYOUT, ROWS, VENDOR, Model
+from mlbatch.sensors.robosense.models import DIFOP, FIRST_LAYOUT, ROWS, VENDOR, Model
 from mlbatch.sensors.robosense.packets import (
     header_table,
     in_time_form,
@@ -55,12 +55,29 @@ from mlbatch.sensors.robosense.packets import (
 )
 from mlbatch.units import RAD_PER_DEG
 
-__all__ = ["BUILT_IN", "MODELS", "VENDOR", "RobosenseLidar", "describe", "read_calibration"]
+__all__ = [
+    "BUILT_IN",
+    "MODELS",
+    "VENDOR",
+    "RobosenseLidar",
+    "describe",
+    "read_calibration",
+]
 
 # Match scores: packets name the model; a file is preferred to device packets.
 _FITS_MODEL = 100
 _FITS_FILE = 200
 _DIFOP_PORT = 7788
+# Default ports: docs/sources/messages.md, section 7; topics and messages: section 1.
+RECORDED = Recorded(
+    port=6699,
+    topic="rslidar_packets",
+    message="rslidar_msg/RslidarPacket",
+    message_ros1="rslidar_msg/RslidarPacket",
+    imu_port=6688,
+    device_port=_DIFOP_PORT,
+    device_magic=DIFOP,
+)
 
 MODELS: tuple[SensorModel, ...] = tuple(
     SensorModel(

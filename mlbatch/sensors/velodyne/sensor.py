@@ -15,7 +15,7 @@ import numpy as np
 from mlbatch.arrays import median
 from mlbatch.errors import RigError
 from mlbatch.lidar.headers import HeaderReader
-from mlbatch.lidar.interface import NAMED_ONLY, Calibration, Evidence, SensorModel
+from mlbatch.lidar.interface import NAMED_ONLY, Calibration, Evidence, Recorded, SensorModel
 from mlbatch.sensors.options import check_options
 from mlbatch.sensors.velodyne.calibration import VelodyneFile, read_velodyne
 from mlbatch.sensors.velodyne.clock import (
@@ -39,7 +39,14 @@ from mlbatch.sensors.velodyne.packets import (
 )
 from mlbatch.units import M_PER_MM, RAD_PER_DEG
 
-__all__ = ["BUILT_IN", "MODELS", "VENDOR", "VelodyneCalibration", "describe", "read_calibration"]
+__all__ = [
+    "BUILT_IN",
+    "MODELS",
+    "VENDOR",
+    "VelodyneCalibration",
+    "describe",
+    "read_calibration",
+]
 
 _FITS_BYTES = 100
 _FITS_FILE = 200
@@ -47,6 +54,14 @@ _FITS_FILE = 200
 _ANGLE_TOLERANCE_DEG = 3.0
 _UNIT_TOLERANCE = 1e-6
 _OPTIONS = {"firing_azimuth": "on", "vertical_offset": "on", "packet_stamp": "start"}
+# Default ports: docs/sources/messages.md, section 7; topics and messages: section 1.
+RECORDED = Recorded(
+    port=2368,
+    topic="velodyne_packets",
+    message="velodyne_msgs/VelodyneScan",
+    message_ros1="velodyne_msgs/VelodyneScan",
+    device_port=8308,
+)
 
 MODELS: tuple[SensorModel, ...] = tuple(
     SensorModel(

@@ -1,0 +1,589 @@
+"""`mlbatch extract`: raw packets of chosen lidars and times, unchanged, into another container.
+
+One pass. Payloads and receive times stay as they are; every packet that is read is written, or
+counted under a reason. Metadata go along: as messages where the container stores those of the
+recording, else as files next to it, with a rig.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from fnmatch import fnmatchcase
+from pathlib import Path
+
+import numpy as np
+
+from mlbatch.arrays import BoolArray, I64Array
+from mlbatch.batching.windows import Limit
+from mlbatch.discovery.calibrations import is_metadata
+from mlbatch.discovery.discover import Discovery, SensorSelection, discover
+from mlbatch.discovery.first_seconds import is_without_packets
+from mlbatch.errors import UsageError
+from mlbatch.frames.tree import some
+from mlbatch.native import require_library
+from mlbatch.pipeline.extract_places import Assigned, ChosenLidar, Place, Places
+from mlbatch.pipeline.passthrough import MessageQueue
+from mlbatch.pipeline.time_limits import text_of_range
+from mlbatch.readers import has_packets, open_recordings
+from mlbatch.readers.byte_records import SLACK
+from mlbatch.rig.rig import DEFAULT_BODY_FRAME, Rig, RigSensor, UnknownExtrinsics
+from mlbatch.rig.write import write_rig
+from mlbatch.ros.packet_writing import Stamped
+from mlbatch.types import Message, PacketBatch, Recording, StreamTable, Topic
+from mlbatch.units import NS_PER_S
+from mlbatch.writers.atomic import Output, discard, export_errors, prepare
+from mlbatch.writers.recordings import (
+    ENCODINGS,
+    MOST_HOST_NS,
+    MOST_UDP_BYTES,
+    PCAP,
+    Bag,
+    PcapFile,
+    frame_head,
+    new_bag,
+)
+
+# Why packets are left out: of no chosen lidar; received before --start or from --end on; the
+# container has no message for them, or no room for their size or time.
+REASONS = ("not_chosen", "outside_time", "no_place")
+# Reading ends so much after the end: the receive times of bags and of several queues step back.
+_AFTER_END_NS = 10 * NS_PER_S
+_KIND_BITS = 17
+# Options of a rig that this command has applied.
+_APPLIED = ("only", "ignore", "pass")
+
+
+@dataclass(frozen=True, slots=True)
+class Extraction:
+    """What to extract: start, end: by receive time; `from_t_init` counts from the first packet.
+
+    duration_ns: instead of an end; passed: patterns of topics to copy.
+    """
+
+    recordings: tuple[Path, ...]
+    output: Path
+    selection: SensorSelection = field(default_factory=SensorSelection)
+    start: Limit | None = None
+    end: Limit | None = None
+    duration_ns: int | None = None
+    passed: tuple[str, ...] = ()
+    overwrite: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class ExtractedLidar:
+    """Packets of a lidar; place: address and port, or topic, of its own packets."""
+
+    name: str
+    model: str
+    place: str
+    read: int
+    written: int
+
+
+@dataclass(frozen=True, slots=True)
+class Extracted:
+    """Result: read = written + sum(left_out), packets by REASONS.
+
+    messages: copied, without packets; first_ns, last_ns: receive times of what was written; files:
+    the recording first; frames: those without a packet, by reason; is_short: the recording has
+    more, which was not read; notes: warnings.
+    """
+
+    lidars: tuple[ExtractedLidar, ...]
+    read: int
+    written: int
+    left_out: dict[str, int]
+    messages: int
+    first_ns: int
+    last_ns: int
+    files: tuple[Path, ...]
+    frames: dict[str, int]
+    is_short: bool
+    notes: tuple[str, ...]
+
+    def rows(self) -> list[tuple[str, ...]]:
+        """A table of the lidars, head first."""
+        head = ("lidar", "model", "to", "packets", "written")
+        return [
+            head,
+            *(
+                (one.name, one.model, one.place, str(one.read), str(one.written))
+                for one in self.lidars
+            ),
+        ]
+
+    def lines(self) -> list[str]:
+        """The ledger and the files, in words."""
+        parts = [f"{self.written} written", *(f"{n} {why}" for why, n in self.left_out.items())]
+        seconds = (self.last_ns - self.first_ns) / NS_PER_S
+        found = [f"read {self.read} packets: {', '.join(parts)}", f"received in {seconds:.3f} s"]
+        if self.messages:
+            found[-1] += f"; {self.messages} messages copied"
+        if self.frames:
+            reasons = ", ".join(f"{count} {why}" for why, count in sorted(self.frames.items()))
+            found.append(f"frames without a packet: {reasons}")
+        if self.is_short:
+            found.append("what was recorded later was not read")
+        return [*found, f"wrote {', '.join(path.name for path in self.files)}"]
+
+
+def extract(request: Extraction, progress: Callable[[int, int], object] | None = None) -> Extracted:
+    """Extract packets; nothing has its final name before all is complete.
+
+    progress: called with the bytes read so far, and with those of all recordings.
+    """
+    target = request.output
+    _check_target(request)
+    require_library()
+    selection = replace(request.selection, identity_extrinsics=True)
+    setup = _discovered(request.recordings, selection)
+    encodings = ENCODINGS[target.suffix]
+    topics = _forwarded(setup.recordings, request, encodings)
+    places = Places(setup, encodings)
+    _refuse_without_place(places, target)
+    texts = _side_files(setup, places, request, topics)
+    outputs: list[Output] = []
+    try:
+        paths = [target, *texts]
+        outputs.extend(prepare(path, request.overwrite, folder=False) for path in paths)
+        with export_errors(target):
+            for output in outputs[1:]:
+                output.partial.write_bytes(texts[output.target])
+            run = _Run(setup, places, request, topics, outputs[0].partial)
+            run.write(progress)
+        # The recording last: with it the others are complete.
+        for output in (*outputs[1:], outputs[0]):
+            output.publish()
+    except BaseException:
+        for output in outputs:
+            discard(output.target)
+        raise
+    return run.result(paths)
+
+
+def _check_target(request: Extraction) -> None:
+    target = request.output
+    if target.suffix not in ENCODINGS:
+        raise UsageError(
+            f"-o: expected a name that ends with {', '.join(ENCODINGS)}, found {target.name}; "
+            "choose one of these"
+        )
+    if request.passed and not ENCODINGS[target.suffix]:
+        raise UsageError(
+            f"--pass: expected a bag, which stores messages, found {target.name}; leave it out, or "
+            "write a .mcap"
+        )
+    for path in request.recordings:
+        if path.exists() and target.exists() and os.path.samefile(path, target):
+            raise UsageError(
+                f"-o: expected another file than the recordings, found {target}; choose another"
+            )
+
+
+def _discovered(paths: Sequence[Path], selection: SensorSelection) -> Discovery:
+    table = StreamTable()
+    opened = open_recordings(paths, table, selection.rig)
+    setup = discover(opened, table, selection, to_convert=False)
+    if not setup.sensors and not setup.noted:
+        # For its reasons.
+        discover(opened, table, selection)
+    return setup
+
+
+def _refuse_without_place(places: Places, target: Path) -> None:
+    """Raise UsageError for a lidar with packets that the container cannot store."""
+    for number, lidar in enumerate(places.lidars):
+        place = places.main_place(number)
+        if place is None or place.to is not None:
+            continue
+        source = places.setup.sampler.table.streams[place.stream]
+        remedy = f"write a .pcap, or --ignore {lidar.name}"
+        what = "packets that ROS drivers publish"
+        if source.topic:
+            remedy = f"--ignore {lidar.name}"
+            what = "raw packets"
+        raise UsageError(
+            f"{target.name}: {lidar.name}: expected {what}, found those of {lidar.model} on "
+            f"{source}, which have no place in it; {remedy}"
+        )
+
+
+def _forwarded(
+    recordings: Sequence[Recording], request: Extraction, encodings: tuple[str, ...]
+) -> frozenset[Topic]:
+    """Topics to copy: calibrations and transforms, and those of `--pass`."""
+    MessageQueue(request.passed, frozenset()).refuse_unknown(recordings)
+    found = set()
+    for topic in (topic for recording in recordings for topic in recording.topics):
+        is_asked = any(fnmatchcase(topic.name, pattern) for pattern in request.passed)
+        if has_packets(topic) or not (is_asked or is_metadata(topic)):
+            continue
+        if topic.encoding in encodings:
+            found.add(topic)
+        elif is_asked:
+            raise UsageError(
+                f"--pass {topic.name}: expected messages encoded as {' or '.join(encodings)} for "
+                f"{request.output.name}, found {topic.encoding!r}; do not pass it"
+            )
+    return frozenset(found)
+
+
+# -- files next to the recording --------------------------------------------------------------
+
+
+def _side_files(
+    setup: Discovery, places: Places, request: Extraction, topics: frozenset[Topic]
+) -> dict[Path, bytes]:
+    """Calibrations and the rig by their paths; a calibration in the folder is not copied."""
+    target = request.output
+    carried = {topic.name for topic in topics}
+    recorded = setup.first.metadata.calibration_texts
+    files: dict[Path, bytes] = {}
+    # By where it comes from: lidars may share one.
+    known: dict[str, Path] = {}
+    metadata: dict[str, Path] = {}
+    for sensor in setup.sensors:
+        origin = sensor.lidar.calibration
+        is_file = bool(origin) and Path(origin).is_file()
+        if origin in carried or not (origin in recorded or is_file):
+            continue
+        if origin not in known:
+            content = recorded[origin] if origin in recorded else Path(origin).read_bytes()
+            suffix = _suffix(content) if origin in recorded else Path(origin).suffix
+            known[origin] = target.with_name(f"{target.stem}.{sensor.name}{suffix}")
+            if is_file and os.path.samefile(Path(origin).parent, target.parent):
+                known[origin] = Path(origin)
+            else:
+                files[known[origin]] = content
+        metadata[sensor.name] = known[origin]
+    is_capture = not ENCODINGS[target.suffix]
+    lacks_frames = any(
+        is_metadata(topic) and not has_packets(topic) and topic not in topics
+        for recording in setup.recordings
+        for topic in recording.topics
+    )
+    streams = setup.sampler.table.streams
+    moves = any(bool(streams[one.stream].topic) == is_capture for one in setup.sampler.kinds)
+    if setup.sensors and (setup.rig is not None or lacks_frames or moves):
+        rig = _rig(setup, places, request, metadata, lacks_frames=lacks_frames)
+        path = target.with_name(f"{target.stem}.rig.yaml")
+        files[path] = write_rig(rig, target.parent).encode()
+    return files
+
+
+def _suffix(content: bytes) -> str:
+    """Suffix of a recorded calibration, by its content: JSON, angles as text or as bytes."""
+    if content.lstrip().startswith(b"{"):
+        return ".json"
+    return ".csv" if content.isascii() else ".dat"
+
+
+def _rig(
+    setup: Discovery,
+    places: Places,
+    request: Extraction,
+    metadata: dict[str, Path],
+    *,
+    lacks_frames: bool,
+) -> Rig:
+    """The rig of the chosen lidars; lacks_frames: the new recording has no transforms."""
+    streams = setup.sampler.table.streams
+    found = []
+    for number, sensor in enumerate(setup.sensors):
+        known = UnknownExtrinsics() if not sensor.pose.is_known else sensor.pose.body_from_sensor
+        rig = sensor.rig or RigSensor(sensor.name, extrinsics=known)
+        extrinsics = known if isinstance(rig.extrinsics, str) and lacks_frames else rig.extrinsics
+        place = places.main_place(number)
+        stream = rig.stream
+        if place is not None and (sensor.rig is None or place.to != streams[place.stream]):
+            stream = places.selector(number)
+        path = metadata.get(sensor.name)
+        found.append(replace(rig, stream=stream, metadata=path, extrinsics=extrinsics))
+    if setup.rig is not None:
+        selects = bool(request.selection.only or request.selection.ignore)
+        kept = tuple(
+            option
+            for option in setup.rig.options
+            if option.name not in _APPLIED or (option.name != "pass" and not selects)
+        )
+        return replace(setup.rig, sensors=tuple(found), options=kept)
+    names = {sensor.name for sensor in found}
+    return Rig(tuple(found), DEFAULT_BODY_FRAME if setup.frame_id in names else setup.frame_id)
+
+
+# -- packets ----------------------------------------------------------------------------------
+
+
+class _Run:
+    """Writes the recording."""
+
+    def __init__(
+        self,
+        setup: Discovery,
+        places: Places,
+        request: Extraction,
+        topics: frozenset[Topic],
+        path: Path,
+    ) -> None:
+        self._setup = setup
+        self._places = places
+        self._topics = topics
+        self._begin_ns, self._end_ns = _limits(request, setup, places.lidars)
+        suffix = request.output.suffix
+        self._pcap = PcapFile(path) if suffix == PCAP else None
+        self._bag: Bag | None = None if suffix == PCAP else new_bag(path, suffix)
+        self._read = 0
+        self._left_out = dict.fromkeys(REASONS, 0)
+        self._messages = 0
+        self._is_short = False
+        # Received, by the recording; written.
+        self._received_ns: tuple[int, int] | None = None
+        self._written_ns: tuple[int, int] | None = None
+        # Messages up to the next packets, by log time; latched ones that were written.
+        self._waiting: deque[Message] = deque()
+        self._latched: set[int] = set()
+        # The newest of a device from before the start, by place and size.
+        self._early: dict[tuple[int, int], tuple[int, Stamped]] = {}
+
+    def write(self, progress: Callable[[int, int], object] | None) -> None:
+        """Read all packets up to the end, and write those that are chosen."""
+        recordings = self._setup.recordings
+        names = frozenset(topic.name for topic in self._topics)
+        for recording in recordings:
+            recording.keep = names
+        try:
+            with contextlib.closing(self._setup.first.whole(is_without_packets)) as batches:
+                for batch in batches:
+                    if self._is_beyond(batch):
+                        self._is_short = True
+                        break
+                    self._add_messages(batch.messages)
+                    self._add(batch)
+                    if progress is not None:
+                        done = sum(recording.position_bytes for recording in recordings)
+                        progress(done, sum(recording.size_bytes for recording in recordings))
+            if self._bag is not None:
+                for place in self._places.places:
+                    last_ns = self._written_ns[1] if self._written_ns else 0
+                    for message in place.messages.rest(last_ns) if place.messages else ():
+                        self._bag.forward(message)
+                self._forward_until(None)
+        finally:
+            for file in (self._pcap, self._bag):
+                if file is not None:
+                    file.close()
+        self._refuse_nothing()
+
+    def _is_beyond(self, batch: PacketBatch) -> bool:
+        if self._end_ns is None or not len(batch):
+            return False
+        return int(batch.host_ns.min()) >= self._end_ns + _AFTER_END_NS
+
+    def _add(self, batch: PacketBatch) -> None:
+        if not len(batch):
+            self._forward_until(None)
+            return
+        self._read += len(batch)
+        first_ns, last_ns = self._received_ns or (int(batch.host_ns.min()), 0)
+        self._received_ns = first_ns, max(last_ns, int(batch.host_ns.max()))
+        assigned = self._places.assign(batch)
+        is_chosen = assigned.place >= 0
+        for number, count in enumerate(np.bincount(assigned.lidar[is_chosen]).tolist()):
+            self._places.lidars[number].read += count
+        self._left_out["not_chosen"] += len(batch) - int(is_chosen.sum())
+        is_inside = np.ones(len(batch), np.bool_)
+        if self._begin_ns is not None:
+            is_inside &= batch.host_ns >= self._begin_ns
+        if self._end_ns is not None:
+            is_inside &= batch.host_ns < self._end_ns
+        outside = np.flatnonzero(is_chosen & ~is_inside)
+        self._left_out["outside_time"] += len(outside)
+        self._keep_early(batch, assigned, outside)
+        rows = np.flatnonzero(is_chosen & is_inside)
+        if len(rows):
+            self._put_early()
+            self._put(batch.take(rows), assigned.lidar[rows], assigned.place[rows])
+        self._forward_until(None)
+
+    # -- what a lidar said of itself before the start ---------------------------------------------
+
+    def _keep_early(self, batch: PacketBatch, assigned: Assigned, rows: I64Array) -> None:
+        """Keep the newest packets of devices from before the start, which calibrate lidars."""
+        if self._begin_ns is None or self._written_ns is not None:
+            return
+        for row in rows[assigned.is_device[rows]].tolist():
+            if batch.host_ns[row] < self._begin_ns:
+                begin, size = int(batch.start[row]), int(batch.size[row])
+                payload = batch.data[begin : begin + size].tobytes()
+                packet = Stamped(int(batch.host_ns[row]), payload)
+                self._early[int(assigned.place[row]), size] = int(assigned.lidar[row]), packet
+
+    def _put_early(self) -> None:
+        """Write what was kept, before the first packets."""
+        if not self._early:
+            return
+        found = sorted(self._early.items(), key=lambda item: item[1][1].host_ns)
+        self._early = {}
+        self._left_out["outside_time"] -= len(found)
+        size = np.array([key[1] for key, _ in found])
+        data = b"".join(packet.payload for _, (_, packet) in found) + bytes(SLACK)
+        place = np.array([key[0] for key, _ in found])
+        batch = PacketBatch(
+            np.frombuffer(data, np.uint8),
+            np.cumsum(size) - size,
+            size,
+            np.array([self._places.places[one].stream for one in place.tolist()]),
+            np.array([packet.host_ns for _, (_, packet) in found]),
+        )
+        self._put(batch, np.array([lidar for _, (lidar, _) in found]), place)
+
+    # -- writing ------------------------------------------------------------------------------
+
+    def _put(self, batch: PacketBatch, lidar: I64Array, place: I64Array) -> None:
+        """Write packets; lidar, place: (n,) of each."""
+        if self._pcap is not None:
+            is_written = self._put_frames(self._pcap, batch, place)
+        else:
+            is_written = np.array(list(self._put_messages(batch, place)), np.bool_)
+        self._left_out["no_place"] += len(batch) - int(is_written.sum())
+        if not is_written.any():
+            return
+        for number, count in enumerate(np.bincount(lidar[is_written]).tolist()):
+            self._places.lidars[number].written += count
+        host_ns = batch.host_ns[is_written]
+        first_ns, last_ns = self._written_ns or (int(host_ns.min()), 0)
+        self._written_ns = min(first_ns, int(host_ns.min())), max(last_ns, int(host_ns.max()))
+
+    def _put_frames(self, pcap: PcapFile, batch: PacketBatch, place: I64Array) -> BoolArray:
+        fits: BoolArray = (batch.size <= MOST_UDP_BYTES) & (batch.host_ns >= 0)
+        fits &= batch.host_ns < MOST_HOST_NS
+        for number in np.unique(place).tolist():
+            if self._places.places[number].to is None:
+                fits &= place != number
+        keys, head = np.unique(place[fits] << _KIND_BITS | batch.size[fits], return_inverse=True)
+        heads = []
+        for key in keys.tolist():
+            to = self._places.places[key >> _KIND_BITS].to
+            if to is not None:
+                heads.append(frame_head(to.source_ip, to.port, key & ((1 << _KIND_BITS) - 1)))
+        pcap.packets(batch.take(np.flatnonzero(fits)), heads, head)
+        return fits
+
+    def _put_messages(self, batch: PacketBatch, place: I64Array) -> Iterator[bool]:
+        """Write packets in messages; yield for each whether it has a place."""
+        data = batch.data.data
+        untimed = self._setup.sampler.table.untimed
+        rows = zip(
+            place.tolist(),
+            batch.start.tolist(),
+            batch.size.tolist(),
+            batch.host_ns.tolist(),
+            strict=True,
+        )
+        for number, begin, size, host_ns in rows:
+            to: Place = self._places.places[number]
+            packet = Stamped(host_ns, bytes(data[begin : begin + size]))
+            if self._bag is None or to.messages is None or not to.messages.fits(packet):
+                yield False
+                continue
+            self._forward_until(host_ns)
+            for message in to.messages.add(packet, is_timed=to.stream not in untimed):
+                self._bag.forward(message)
+            yield True
+
+    # -- messages -----------------------------------------------------------------------------
+
+    def _add_messages(self, messages: Sequence[Message]) -> None:
+        """Take messages in the time limits, and what describes sensors from before."""
+        found = []
+        for message in messages:
+            if message.topic not in self._topics:
+                continue
+            if self._end_ns is not None and message.host_ns >= self._end_ns:
+                continue
+            if self._begin_ns is None or message.host_ns >= self._begin_ns:
+                found.append(message)
+            elif is_metadata(message.topic) and not message.topic.name.endswith("/tf"):
+                # At the start, so that players do not wait; once, if it is published again.
+                key = hash((message.topic.name, bytes(message.data)))
+                if key not in self._latched:
+                    self._latched.add(key)
+                    found.append(message._replace(host_ns=self._begin_ns))
+        self._waiting.extend(sorted(found, key=lambda message: message.host_ns))
+
+    def _forward_until(self, host_ns: int | None) -> None:
+        """Write the messages up to a time; None: all."""
+        while self._waiting and (host_ns is None or self._waiting[0].host_ns <= host_ns):
+            message = self._waiting.popleft()
+            if self._bag is not None:
+                self._bag.forward(message)
+                self._messages += 1
+
+    # -- result -------------------------------------------------------------------------------
+
+    def _refuse_nothing(self) -> None:
+        if self._written_ns is not None:
+            return
+        if self._received_ns is None:
+            raise UsageError("expected packets in the recordings, found none; check the files")
+        raise UsageError(
+            "expected packets of the chosen lidars in the time limits, found none; packets were "
+            f"received {text_of_range(*self._received_ns)}"
+        )
+
+    def result(self, files: Sequence[Path]) -> Extracted:
+        """Counts and notes."""
+        places = self._places
+        frames: dict[str, int] = {}
+        notes = []
+        for recording in self._setup.recordings:
+            notes += [f"{recording.path.name}: {note}" for note in recording.notes]
+            for reason, count in recording.counts.skipped.items():
+                frames[reason] = frames.get(reason, 0) + count
+        for place in places.places:
+            if place.to is None:
+                source = self._setup.sampler.table.streams[place.stream]
+                notes.append(f"{source}: {files[0].name} has no place for these packets")
+        bare = [lidar.name for lidar in places.lidars if lidar.sensor is None and lidar.written]
+        if bare:
+            notes.append(f"no calibration of {some(bare, len(bare))} was found: add it to convert")
+        first_ns, last_ns = self._written_ns or (0, 0)
+        lidars = []
+        for number, lidar in enumerate(places.lidars):
+            main = places.main_place(number)
+            to = "" if main is None else str(main.to)
+            lidars.append(ExtractedLidar(lidar.name, lidar.model, to, lidar.read, lidar.written))
+        return Extracted(
+            tuple(lidars),
+            self._read,
+            sum(lidar.written for lidar in lidars),
+            {reason: count for reason, count in self._left_out.items() if count},
+            self._messages,
+            first_ns,
+            last_ns,
+            tuple(files),
+            frames,
+            self._is_short,
+            tuple(notes),
+        )
+
+
+def _limits(
+    request: Extraction, setup: Discovery, lidars: Sequence[ChosenLidar]
+) -> tuple[int | None, int | None]:
+    """Receive times in [begin, end), ns; None: no limit."""
+    sampled = setup.sampler.kinds
+    firsts = [
+        sampled[kind].first_host_ns for one in lidars for kind in one.kinds if kind in sampled
+    ]
+    first_ns = min(firsts, default=0)
+    begin_ns = None if request.start is None else request.start.at(first_ns)
+    end_ns = None if request.end is None else request.end.at(first_ns)
+    if request.duration_ns is not None:
+        end_ns = (first_ns if begin_ns is None else begin_ns) + request.duration_ns
+    return begin_ns, end_ns
