@@ -12,9 +12,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from mlbatch.arrays import I64Array, U8Array
+from mlbatch.arrays import BoolArray, I64Array, U8Array
 from mlbatch.discovery.sampler import are_neighbours, split_by_kind
 from mlbatch.discovery.types import DetectedSensor, PacketKind
+from mlbatch.lidar.interface import Lidar
 from mlbatch.rig.rig import StreamSelector
 from mlbatch.types import PacketBatch, Stream, StreamTable
 
@@ -78,10 +79,8 @@ class Router:
                 owner[index] = route.sensors[0]
                 continue
             for number in route.sensors:
-                lidar = self._sensors[number].lidar
                 left = index[owner[index] < 0]
-                packets = batch.data[batch.start[left, None] + np.arange(lidar.packet_size)]
-                owner[left[lidar.sent_by_me(packets)]] = number
+                owner[left[_is_sent_by(self._sensors[number].lidar, batch, left)]] = number
         return owner
 
     def _forget_unassigned(self) -> None:
@@ -150,3 +149,13 @@ class Router:
         if len(near) > 1 and not stream.topic:
             near = [n for n in near if self._sensors[n].lidar.imu_port == stream.port]
         return near[0] if len(near) == 1 else None
+
+
+def _is_sent_by(lidar: Lidar, batch: PacketBatch, rows: I64Array) -> BoolArray:
+    """Which packets (k,) may be a lidar's, by their serial numbers."""
+    start = batch.start[rows]
+    if lidar.reader is None:
+        return lidar.sent_by_me(batch.data[start[:, None] + np.arange(lidar.packet_size)])
+    # Keys that are given are not computed.
+    keys = np.zeros(len(rows), np.int64)
+    return lidar.reader.read(batch.data, start, batch.host_ns[rows], keys).is_mine

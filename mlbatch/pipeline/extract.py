@@ -27,7 +27,7 @@ from mlbatch.frames.tree import some
 from mlbatch.native import require_library
 from mlbatch.pipeline.extract_places import Assigned, ChosenLidar, Place, Places
 from mlbatch.pipeline.passthrough import MessageQueue
-from mlbatch.pipeline.time_limits import text_of_range
+from mlbatch.pipeline.time_limits import refuse_outside, text_of_range
 from mlbatch.readers import has_packets, open_recordings
 from mlbatch.readers.byte_records import SLACK
 from mlbatch.rig.rig import DEFAULT_BODY_FRAME, Rig, RigSensor, UnknownExtrinsics
@@ -121,7 +121,10 @@ class Extracted:
         """The ledger and the files, in words."""
         parts = [f"{self.written} written", *(f"{n} {why}" for why, n in self.left_out.items())]
         seconds = (self.last_ns - self.first_ns) / NS_PER_S
-        found = [f"read {self.read} packets: {', '.join(parts)}", f"received in {seconds:.3f} s"]
+        found = [
+            f"read {self.read} packets: {', '.join(parts)}",
+            f"received within {seconds:.3f} s",
+        ]
         if self.messages:
             found[-1] += f"; {self.messages} messages copied"
         if self.frames:
@@ -273,7 +276,12 @@ def _side_files(
         rig = _rig(setup, places, request, metadata, lacks_frames=lacks_frames)
         path = target.with_name(f"{target.stem}.rig.yaml")
         files[path] = write_rig(rig, target.parent).encode()
-    return files
+    # An earlier extract may share them.
+    return {
+        path: content
+        for path, content in files.items()
+        if not (path.is_file() and path.read_bytes() == content)
+    }
 
 
 def _suffix(content: bytes) -> str:
@@ -339,6 +347,8 @@ class _Run:
         self._bag: Bag | None = None if suffix == PCAP else new_bag(path, suffix)
         self._read = 0
         self._left_out = dict.fromkeys(REASONS, 0)
+        # Of REASONS the last, by stream and size.
+        self._without_place: dict[tuple[int, int], int] = {}
         self._messages = 0
         self._is_short = False
         # Received, by the recording; written.
@@ -450,6 +460,9 @@ class _Run:
             is_written = self._put_frames(self._pcap, batch, place)
         else:
             is_written = np.array(list(self._put_messages(batch, place)), np.bool_)
+        for row in np.flatnonzero(~is_written).tolist():
+            kind = int(batch.stream[row]), int(batch.size[row])
+            self._without_place[kind] = self._without_place.get(kind, 0) + 1
         self._left_out["no_place"] += len(batch) - int(is_written.sum())
         if not is_written.any():
             return
@@ -545,10 +558,14 @@ class _Run:
             notes += [f"{recording.path.name}: {note}" for note in recording.notes]
             for reason, count in recording.counts.skipped.items():
                 frames[reason] = frames.get(reason, 0) + count
-        for place in places.places:
-            if place.to is None:
-                source = self._setup.sampler.table.streams[place.stream]
-                notes.append(f"{source}: {files[0].name} has no place for these packets")
+        for (stream, size), count in self._without_place.items():
+            source = self._setup.sampler.table.streams[stream]
+            notes.append(
+                f"{source}: {files[0].name} has no place for {count} packets of {size} bytes: no "
+                "message of drivers contains them"
+                if self._bag is not None
+                else f"{source}: {files[0].name} has no place for {count} packets of {size} bytes"
+            )
         bare = [lidar.name for lidar in places.lidars if lidar.sensor is None and lidar.written]
         if bare:
             notes.append(f"no calibration of {some(bare, len(bare))} was found: add it to convert")
@@ -582,6 +599,7 @@ def _limits(
         sampled[kind].first_host_ns for one in lidars for kind in one.kinds if kind in sampled
     ]
     first_ns = min(firsts, default=0)
+    refuse_outside(request.start, request.end, first_ns, "the first packet")
     begin_ns = None if request.start is None else request.start.at(first_ns)
     end_ns = None if request.end is None else request.end.at(first_ns)
     if request.duration_ns is not None:

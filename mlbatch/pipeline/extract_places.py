@@ -203,18 +203,22 @@ class Places:
             return self._near[kind]
         streams = self.setup.sampler.table.streams
         stream = streams[kind.stream]
-        near = (
+        near = [
             number
             for number, lidar in enumerate(self.lidars)
             if any(are_neighbours(streams[one.stream], stream) for one in lidar.kinds)
-        )
-        found = next(near, -1)
-        if found < 0:
-            # A lidar may begin later.
+        ]
+        # A lidar may begin later. Of several, it is not known whose packets would be moved.
+        if not near or (len(near) > 1 and not self._keeps(stream)):
             return -1
         is_lidar = "lidar" in (sensors.describe(kind.size, sample) or "")
-        self._near[kind] = -1 if is_lidar else found
+        self._near[kind] = -1 if is_lidar else near[0]
         return self._near[kind]
+
+    def _keeps(self, source: Stream) -> bool:
+        """Whether packets keep their topic, or address and port."""
+        topic = self._topics.get(source.topic)
+        return not self.encodings if topic is None else topic.encoding in self.encodings
 
     def _learn(self, lidar: ChosenLidar, size: int, sample: U8Array) -> None:
         if lidar.recorded is None:
@@ -247,7 +251,7 @@ class Places:
     def _messages(self, lidar: int, source: Stream, use: Use) -> PacketMessages | None:
         one = self.lidars[lidar]
         topic = self._topics.get(source.topic)
-        if topic is None or topic.encoding not in self.encodings:
+        if topic is None or not self._keeps(source):
             if one.recorded is None:
                 return None
             encoding = self.encodings[0]

@@ -95,15 +95,21 @@ def _refuse_disorder(options: tuple[str, str], first: Limit | None, last: Limit 
         )
 
 
-def refuse_outside(start: Limit | None, end: Limit | None, first_ns: int) -> None:
-    """Raise UsageError for a limit, no `+S`, before the recording; first_ns: its first stamp."""
+def refuse_outside(
+    start: Limit | None, end: Limit | None, first_ns: int, zero: str = "the start of scan 0"
+) -> None:
+    """Raise UsageError for a limit, no `+S`, before the recording.
+
+    first_ns: its first stamp, or receive time; zero: where `+S` counts from.
+    """
     early_ns = EARLY_NS if first_ns >= EPOCH_NS else EARLY_UPTIME_NS
     for option, limit, allowed_ns in (("--start", start, early_ns), ("--end", end, WINDOW_NS)):
         if limit is None or limit.from_t_init or limit.ns >= first_ns - allowed_ns:
             continue
         raise UsageError(
             f"{option}: expected a time of the recording, which begins at "
-            f"{text_of_time(first_ns)}, found {text_of_time(limit.ns)}; {_advice(option, limit.ns)}"
+            f"{text_of_time(first_ns)}, found {text_of_time(limit.ns)}; "
+            f"{_advice(option, limit.ns, zero)}"
         )
 
 
@@ -112,11 +118,11 @@ def text_of_range(first_ns: int, last_ns: int) -> str:
     return f"from {text_of_time(first_ns)} to {text_of_time(last_ns)}"
 
 
-def _advice(option: str, limit_ns: int) -> str:
+def _advice(option: str, limit_ns: int, zero: str) -> str:
     if 0 <= limit_ns < DAY_NS:
         seconds = _seconds(limit_ns)
-        return f"write {option} +{seconds} for {seconds} s after the start of scan 0"
-    return "correct it, or write +SECONDS after the start of scan 0"
+        return f"write {option} +{seconds} for {seconds} s after {zero}"
+    return f"correct it, or write +SECONDS after {zero}"
 
 
 def text_of_time(time_ns: int) -> str:

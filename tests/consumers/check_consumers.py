@@ -15,7 +15,10 @@ from typing import Any
 import numpy as np
 import pytest
 
+from tests.builders.captures import pcap_bytes
+from tests.builders.four_makers import FOLDER as FOUR_MAKERS
 from tests.builders.run import TWO_LIDARS, command
+from tests.builders.traffic import datagrams_of, read_pcap
 from tests.consumers.environments import need_library, read_by, run_in, run_of_system
 
 SCANS = 7
@@ -349,3 +352,46 @@ def test_scans_csv_has_numbers_only(consumer: str, outputs: Path) -> None:
         wrapped = (sum(int(row[name]) for row in rows) + 2**63) % 2**64 - 2**63
         assert int(total) == wrapped, name
     assert json.dumps(found)
+
+
+# -- vendors: captures of `mlbatch extract` -------------------------------------------------------
+
+
+def extracted(folder: Path, source: Path, rig: Path, lidar: str) -> Path:
+    """A capture of one lidar, by way of an MCAP file."""
+    bag = folder / "bag.mcap"
+    capture = folder / "capture.pcap"
+    for run in (
+        command("extract", source, "--rig", rig, "--only", lidar, "-o", bag, "--quiet"),
+        command("extract", bag, "--rig", folder / "bag.rig.yaml", "-o", capture, "--quiet"),
+    ):
+        assert run.code == 0, run.err
+    return capture
+
+
+def test_ouster_sdk(tmp_path: Path) -> None:
+    """SOURCE.md: 4336 columns. The SDK refuses the fixture itself: two IMUs on one port."""
+    source = TWO_LIDARS / "two_lidars.pcap"
+    capture = extracted(tmp_path, source, TWO_LIDARS / "rig.yaml", "left")
+    metadata = json.loads((TWO_LIDARS / "left.json").read_text(encoding="utf-8"))
+    # The SDK expects it, and may be told nothing by it.
+    path = tmp_path / "sdk.json"
+    path.write_text(json.dumps(metadata | {"calibration_status": {}}), encoding="utf-8")
+    found = read_by("ouster-sdk", capture, path)
+    assert found == {"columns": 4336, "serials": ["122647000123"]}
+
+
+def test_velodyne_decoder(tmp_path: Path) -> None:
+    """What it reads from the frames of the lidar as they were captured."""
+    source = FOUR_MAKERS / "four_makers.pcap"
+    frames = [
+        one.frame()
+        for one in datagrams_of(read_pcap(source))
+        if (one.source, one.port) == ("192.168.1.201", 2368)
+    ]
+    original = tmp_path / "original.pcap"
+    original.write_bytes(pcap_bytes(frames))
+    capture = extracted(tmp_path, source, FOUR_MAKERS / "rig.yaml", "roof")
+    found = read_by("velodyne-decoder", capture)
+    assert found["points"] > 50_000
+    assert found == read_by("velodyne-decoder", original)

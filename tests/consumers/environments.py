@@ -58,6 +58,8 @@ ENVIRONMENTS = {
         Environment("rerun", ("rerun-sdk==0.41.0",)),
         Environment("rosbags", ("rosbags==0.11.9",)),
         Environment("mcap-ros2", ("mcap-ros2-support==0.6.0", "numpy")),
+        Environment("ouster-sdk", ("ouster-sdk==1.0.1",)),
+        Environment("velodyne-decoder", ("velodyne-decoder==3.1.0",)),
         Environment("polars", ("polars==2.1.0",)),
         Environment("pandas", ("pandas==3.1.1",)),
         Environment(

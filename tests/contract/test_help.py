@@ -39,6 +39,7 @@ OPTIONS: dict[str, set[str]] = {
         "sensors": "json",
         "verify": "report json verbose",
         "report": "output report html-scans overwrite",
+        "extract": "output rig metadata only ignore start end duration pass overwrite quiet verbose",
         "simulate": "output duration seed overwrite quiet",
         "schema": "",
         "calibrate": """
