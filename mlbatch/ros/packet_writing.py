@@ -63,8 +63,8 @@ class PacketMessages:
     def add(self, packet: Stamped, *, is_timed: bool = True) -> Iterator[Message]:
         """Yield the messages that a packet completes, each of the time of its last packet.
 
-        is_timed: False where the time is not that of the packet, but that of a message with many:
-        then a reader is told so.
+        is_timed: False where the time is not that of the packet, but that of a message with many;
+        then stamps are empty, so that readers know.
         """
         is_timed = is_timed and self._is_stamped
         if self._waiting and not is_timed and packet.host_ns != self._waiting[0].host_ns:

@@ -39,7 +39,7 @@ MOST_UDP_BYTES = 65535 - IP.__hdr_len__ - UDP.__hdr_len__
 # Seconds of a record have 32 bits.
 MOST_HOST_NS = 2**32 * NS_PER_S
 
-# Destinations: recordings do not tell them.
+# Destinations, which are not known.
 _RECEIVERS = {4: ipaddress.IPv4Address("10.5.5.1").packed, 6: ipaddress.IPv6Address("::1").packed}
 _FILE_HEADER = struct.pack("<IHHiIII", 0xA1B23C4D, 2, 4, 0, 0, 262144, 1)
 _RECORD = np.dtype([(name, "<u4") for name in ("second", "rest_ns", "captured", "original")])
@@ -143,9 +143,12 @@ class Bag(Protocol):
 
 def new_bag(path: Path, suffix: str) -> Bag:
     """Create a container of messages; suffix: of its final name."""
-    if suffix == MCAP:
-        return McapFile(path)
-    return Rosbag1Bag(path) if suffix == ROSBAG1 else SqliteFile(path)
+    if suffix == ROSBAG1:
+        # Not loaded for other containers.
+        from mlbatch.writers.rosbag1_container import Rosbag1Container
+
+        return Rosbag1Container(path)
+    return McapFile(path) if suffix == MCAP else SqliteFile(path)
 
 
 class McapFile:
@@ -168,25 +171,6 @@ class McapFile:
     def close(self) -> None:
         """Complete the file."""
         self._container.close()
-
-
-class Rosbag1Bag:
-    """A ROS 1 bag, chunks without compression."""
-
-    def __init__(self, path: Path) -> None:
-        """Create the file."""
-        # Not loaded for other containers.
-        from mlbatch.writers.formats.rosbag1 import Rosbag1File
-
-        self._bag = Rosbag1File(path)
-
-    def forward(self, message: Message) -> None:
-        """Append a message; the first one creates its topic."""
-        self._bag.forward(message)
-
-    def close(self) -> None:
-        """Complete the file."""
-        self._bag.close()
 
 
 class SqliteFile:

@@ -39,7 +39,9 @@ OPTIONS: dict[str, set[str]] = {
         "sensors": "json",
         "verify": "report json verbose",
         "report": "output report html-scans overwrite",
-        "extract": "output rig metadata only ignore start end duration pass overwrite quiet verbose",
+        "extract": """
+            output rig metadata only ignore start end duration pass overwrite quiet verbose
+        """,
         "simulate": "output duration seed overwrite quiet",
         "schema": "",
         "calibrate": """
@@ -250,6 +252,6 @@ def test_the_root_offers_its_names_without_loading_them() -> None:
     )
     names = [
         *("Calibration", "MlbatchError", "Recording", "Run", "Scan", "calibrate", "convert"),
-        *("digest", "inspect", "open"),
+        *("digest", "extract", "inspect", "open"),
     ]
     assert printed.strip() == str([*names, "read", "scans", "verify"])
