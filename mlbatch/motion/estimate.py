@@ -59,8 +59,10 @@ class Estimate:
 class VelocityEstimator:
     """Takes the points of one window after the other."""
 
-    def __init__(self) -> None:
-        self._map = LocalMap(_EDGE_M, _WINDOWS)
+    def __init__(self, windows: int = _WINDOWS) -> None:
+        """windows: how many are kept for the next one; more drift less, and cost more."""
+        self._windows = windows
+        self._map = LocalMap(_EDGE_M, windows)
         self._pose: Pose = ORIGIN
         self._velocity = np.zeros(6)
         # Middle of the last window that is in the map, or of the first one.
@@ -105,7 +107,7 @@ class VelocityEstimator:
         velocity = np.zeros(6)
         query = _thinned(cloud)
         for _ in range(_MOST_ROUNDS):
-            self._map = LocalMap(_EDGE_M, _WINDOWS)
+            self._map = LocalMap(_EDGE_M, self._windows)
             self._map.add(first.moved(velocity))
             found = register(self._map.distributions(), query, ORIGIN, gap_s, velocity)
             if found.failure:

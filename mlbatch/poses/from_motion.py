@@ -1,17 +1,50 @@
 """Poses of lidars from the motion of the machine alone, without a guess.
 
-Each lidar measures its own motion from window to window, in its own frame, however it is mounted.
-All are on one rigid body, so that the twist of one in its frame is that of the first lidar in the
-other's (hand-eye calibration: K. Daniilidis, 1999; here per twist, weighted by their covariances).
+Each lidar measures its own motion from window to window, in its own frame, however it is mounted:
+`motion/estimate.py` does, in a frame whose z axis is the most frequent normal of surfaces.
+`hand_eye.py` finds the pose that makes these motions one.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
+import numpy as np
+
 from mlbatch.arrays import F64Array, I64Array
-from mlbatch.motion.registration import Pose
+from mlbatch.motion.estimate import VelocityEstimator
+from mlbatch.motion.registration import ORIGIN, Cloud, Pose
+from mlbatch.motion.se3 import exp_rotation
+from mlbatch.poses.hand_eye import Steps, hand_eye, known_rows
+from mlbatch.poses.surfaces import planes
+from mlbatch.units import NS_PER_S
+
+# A map of 2 s drifts by some mm over 8 s.
+_MAP_WINDOWS = 20
+# More points a window do not make the motion better.
+_MOST_POINTS = 30_000
+# Cells, m, and least cosine between normals, of the direction that stands for upward.
+_UP_EDGE_M = 1.0
+_UP_PARALLEL = 0.97
+_FEWEST_PLANES = 20
+# Fewer steps determine nothing.
+_LEAST_STEPS = 30
+# Root mean square of a step, m and rad a second; less is standstill.
+_LEAST_SPEED = 0.05
+_LEAST_TURN = 0.01
+# Standard deviations of a pose that can be used as it is: a third of 20 mm and 0.1 degrees.
+_MOST_SIGMA_M = 0.007
+_MOST_SIGMA_RAD = math.radians(0.035)
+# And of a start that surfaces in common can refine, of which a guess may be 1 m and 20 degrees off.
+_MOST_START_RAD = math.radians(6.0)
+_ALONG = math.cos(math.radians(25.0))
+
+_INSTEAD = (
+    "drive a figure of eight, over a kerb; or give a guess and calibrate where the lidars see the "
+    "same surfaces"
+)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -24,41 +57,216 @@ class SensorCloud:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class MotionWindow:
+    """A window [start_ns, end_ns) with a cloud of each lidar."""
+
+    start_ns: int
+    end_ns: int
+    clouds: Sequence[SensorCloud]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class MotionPose:
     """Pose of a lidar as its motion gives it.
 
-    first_from_lidar: where nothing determines it along `weak`, the shift is the shortest one;
-    sigma: (6,), standard deviations of shift, m, and turn, rad, in the frame of the first lidar,
-    of what is determined; weak: (6, w), unit directions of shift and turn that the motion does not
-    determine; undetermined: the same in words, each with what to record instead; refusal: why there
-    is no pose that a refinement could start from, or "".
+    first_from_lidar: where nothing determines it, the shift is the shortest one; sigma: (6,),
+    standard deviations of shift, m, and turn, rad, in the frame of the first lidar; covariance:
+    (6, 6); weak: (6, w), unit directions of a shift or a turn that are known too badly to be used
+    without a refinement; undetermined: the same in words; refusal: why there is no pose that a
+    refinement could start from, or "".
     """
 
     first_from_lidar: Pose
-    sigma: F64Array
+    covariance: F64Array
     weak: F64Array
     undetermined: tuple[str, ...]
     refusal: str
 
+    @property
+    def sigma(self) -> F64Array:
+        """Standard deviations (6,)."""
+        found: F64Array = np.sqrt(np.diag(self.covariance))
+        return found
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MotionPoses:
-    """Poses of all lidars, the first one as it is; refusal: of all of them, or "".
+    """Poses of all lidars, the first one at the origin.
 
-    twists: number of pairs of windows whose motion was used, of each lidar.
+    steps: windows whose motion was measured, of each lidar; middle_ns: (k,), of all windows;
+    twist: (lidars, k, 6), motion from the middle of the window before in the frame of the lidar,
+    m and rad, NaN where it is not known.
     """
 
     poses: tuple[MotionPose, ...]
-    twists: tuple[int, ...]
-    refusal: str
+    steps: tuple[int, ...]
+    middle_ns: I64Array
+    twist: F64Array
+
+    @property
+    def refusal(self) -> str:
+        """Why a pose cannot even be a start, of the first such lidar, or ""."""
+        return next((pose.refusal for pose in self.poses if pose.refusal), "")
+
+    @property
+    def undetermined(self) -> tuple[str, ...]:
+        """Directions of all lidars that need surfaces in common."""
+        return tuple(words for pose in self.poses for words in pose.undetermined)
 
 
-def poses_from_motion(
-    windows: Iterable[Sequence[SensorCloud]], names: Sequence[str]
-) -> MotionPoses:
+def poses_from_motion(windows: Iterable[MotionWindow], names: Sequence[str]) -> MotionPoses:
     """Poses of lidars in the frame of the first one.
 
-    windows: each a cloud for each lidar, in order of `names`, consecutive; only the last few are
-    held.
+    windows: consecutive ones, each with a cloud for each of `names`; the last ones are held only.
     """
-    raise NotImplementedError
+    odometries = [Odometry() for _ in names]
+    middle_ns: list[int] = []
+    twists: list[list[F64Array]] = []
+    for window in windows:
+        middle_ns.append((window.start_ns + window.end_ns) // 2)
+        twists.append(
+            [
+                odometry.add(cloud, window.start_ns, window.end_ns)
+                for odometry, cloud in zip(odometries, window.clouds, strict=True)
+            ]
+        )
+    twist = np.array(twists).reshape(-1, len(names), 6).transpose(1, 0, 2)
+    return poses_of_twists(twist, np.array(middle_ns, np.int64), names)
+
+
+def poses_of_twists(twist: F64Array, middle_ns: I64Array, names: Sequence[str]) -> MotionPoses:
+    """Poses of lidars whose motions (lidars, k, 6) from the middle of each window are known."""
+    steps = tuple(int(known_rows(own).sum()) for own in twist)
+    first = MotionPose(ORIGIN, np.zeros((6, 6)), np.zeros((6, 0)), (), "")
+    others = (
+        _pose(twist[0], own, middle_ns, (names[0], name))
+        for own, name in zip(twist[1:], names[1:], strict=True)
+    )
+    return MotionPoses((first, *others), steps, middle_ns, twist)
+
+
+class Odometry:
+    """Motion of one lidar in its own frame, whichever way that is turned."""
+
+    def __init__(self) -> None:
+        self._estimator = VelocityEstimator(_MAP_WINDOWS)
+        self._upright: F64Array | None = None
+        self._middle_ns: int | None = None
+
+    def add(self, cloud: SensorCloud, start_ns: int, end_ns: int) -> F64Array:
+        """Twist (6,) from the middle of the window before, m and rad; NaN where it is unknown."""
+        every = -(-len(cloud.stamp_ns) // _MOST_POINTS) or 1
+        points_m = np.asarray(cloud.points_m[::every], np.float64)
+        if self._upright is None:
+            self._upright = _upright(points_m)
+        turn = np.eye(3) if self._upright is None else self._upright
+        stamps, column = np.unique(cloud.stamp_ns[::every], return_inverse=True)
+        middle_ns = (start_ns + end_ns) // 2
+        time_s = (stamps - middle_ns) / NS_PER_S
+        cloud_up = Cloud(np.matmul(points_m, turn.T), column, time_s)
+        velocity = self._estimator.add(cloud_up, middle_ns, end_ns - start_ns).velocity
+        gap_s = 0.0 if self._middle_ns is None else (middle_ns - self._middle_ns) / NS_PER_S
+        self._middle_ns = middle_ns
+        if velocity is None:
+            return np.full(6, np.nan)
+        return gap_s * np.concatenate([np.matmul(part, turn) for part in velocity.reshape(2, 3)])
+
+
+def _upright(points_m: F64Array) -> F64Array | None:
+    """Rotation (3, 3) of the most frequent normal of surfaces onto the z axis, or None.
+
+    Of a field or a forest that is the ground's, so that trunks are upright.
+    """
+    normal = planes(points_m, np.zeros(len(points_m)), _UP_EDGE_M).normal
+    if len(normal) < _FEWEST_PLANES:
+        return None
+    is_parallel = np.abs(np.matmul(normal, normal.T)) > _UP_PARALLEL
+    alike = normal[is_parallel[int(is_parallel.sum(axis=1).argmax())]]
+    _, axes = np.linalg.eigh(np.matmul(alike.T, alike))
+    x, y, z = axes[:, 2]
+    # About the axis at right angles to both.
+    size = math.hypot(x, y)
+    if size < 1e-9:
+        return np.eye(3)
+    vector = np.array([y, -x, 0.0]) * (math.atan2(size, z) / size)
+    turn: F64Array = exp_rotation(vector[None])[0]
+    return turn
+
+
+def _pose(
+    first: F64Array, other: F64Array, middle_ns: I64Array, names: tuple[str, str]
+) -> MotionPose:
+    """Pose of a lidar by its twists (k, 6) and those of the first one."""
+    known = known_rows(first) & known_rows(other)
+    count = int(known.sum())
+    if count < _LEAST_STEPS:
+        alone = [int(known_rows(own).sum()) for own in (first, other)]
+        return _refused(
+            f"{names[1]}: expected {_LEAST_STEPS} windows with the motion of both {names[0]} and "
+            f"{names[1]}, found {count} ({alone[0]} and {alone[1]} of {len(known)}); record "
+            "longer, where the lidars see walls, cars or trunks around them"
+        )
+    step_s = float(np.median(np.diff(middle_ns))) / NS_PER_S
+    sizes = np.sqrt((first[known] ** 2).mean(axis=0)) / step_s
+    speed, turn = (float(np.sqrt((part**2).sum())) for part in (sizes[:3], sizes[3:]))
+    if speed < _LEAST_SPEED and turn < _LEAST_TURN:
+        return _refused(
+            f"{names[1]}: expected a machine that moves, found {speed:.3f} m/s and "
+            f"{math.degrees(turn):.2f} degrees/s; {_INSTEAD}"
+        )
+    found = hand_eye(Steps(first, other, np.zeros(len(first), np.int64)))
+    shift, axis = _main_axis(first[known, :3]), _main_axis(first[known, 3:])
+    turns = _weak(found.covariance[3:, 3:], _MOST_SIGMA_RAD)
+    shifts = _weak(found.covariance[:3, :3], _MOST_SIGMA_M)
+    words = [
+        f"{names[1]}: turn about {_named(way, shift, 'the direction of travel')} known to "
+        f"{math.degrees(sigma):.2g} degrees only; {_INSTEAD}"
+        for way, sigma in turns
+    ] + [
+        f"{names[1]}: shift along {_named(way, axis, 'the axis of its turns')} known to "
+        f"{1000.0 * sigma:.2g} mm only; {_INSTEAD}"
+        for way, sigma in shifts
+    ]
+    worst = max((sigma for _, sigma in turns), default=0.0)
+    refusal = ""
+    if worst > _MOST_START_RAD:
+        refusal = words[len(turns) - 1]
+    elif not found.is_unique:
+        refusal = f"{names[1]}: the motion fits poses far from each other; {_INSTEAD}"
+    weak = [np.concatenate([np.zeros(3), way]) for way, _ in turns]
+    weak += [np.concatenate([way, np.zeros(3)]) for way, _ in shifts]
+    return MotionPose(
+        found.first_from_other,
+        found.covariance,
+        np.array(weak).reshape(-1, 6).T,
+        tuple(words),
+        refusal,
+    )
+
+
+def _refused(reason: str) -> MotionPose:
+    return MotionPose(ORIGIN, np.diag([np.inf] * 6), np.eye(6), (), reason)
+
+
+def _weak(covariance: F64Array, most: float) -> list[tuple[F64Array, float]]:
+    """Unit directions (3,) with their standard deviations above a limit, increasing."""
+    variance, axes = np.linalg.eigh(covariance)
+    return [
+        (axis, math.sqrt(size))
+        for axis, size in zip(axes.T, variance, strict=True)
+        if size > most**2
+    ]
+
+
+def _main_axis(vectors: F64Array) -> F64Array:
+    """Direction (3,) along which vectors (k, 3) are largest."""
+    _, axes = np.linalg.eigh(np.matmul(vectors.T, vectors))
+    axis: F64Array = axes[:, 2]
+    return axis
+
+
+def _named(way: F64Array, axis: F64Array, name: str) -> str:
+    """A direction in the frame of the first lidar, by name if it lies along an axis."""
+    x, y, z = way * (1.0 if way[int(np.abs(way).argmax())] > 0.0 else -1.0)
+    place = f"({x:.2f}, {y:.2f}, {z:.2f}) in the frame of the first lidar"
+    return f"{name}, {place}," if abs(float(np.dot(way, axis))) > _ALONG else f"{place},"

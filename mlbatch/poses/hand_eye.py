@@ -1,0 +1,248 @@
+"""Pose between two sensors of one rigid body, from the motion that each of them measured.
+
+If A and B are the twists of two sensors over one span of time, each in its own frame, and R, t the
+pose of the second one in the frame of the first one, then exactly (R. Murray, Z. Li, S. Sastry, "A
+Mathematical Introduction to Robotic Manipulation", 1994, section 2.4)
+
+    turn   B = R' A
+    shift  B = R' (A + turn of A x t)
+
+Each step of an odometry has an error of its own, which stays, and its poses have errors that the
+next step takes back. Both variances are estimated from what the fit leaves: sine transforms of a
+run of steps are independent then, and slow motions, where errors that are taken back cancel, weigh
+more.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from itertools import permutations, product
+
+import numpy as np
+
+from mlbatch.arrays import BoolArray, F64Array, I64Array
+from mlbatch.motion.registration import Pose
+from mlbatch.motion.se3 import exp_rotation, skew
+
+# Runs are cut into pieces of so many steps.
+_MOST_STEPS = 200
+# Standard deviations of a step before any is estimated: shift, m, and turn, rad.
+_FIRST_SIGMA = np.array([0.01] * 3 + [0.002] * 3)
+# Variances that are tried, as shares of the mean square of the differences.
+_SHARES = np.geomspace(1e-4, 2.0, 40)
+# Differences beyond, in robust standard deviations, are errors of an odometry.
+_MOST_SIGMAS = 6.0
+_ROUNDS = 4
+_MOST_ITERATIONS = 30
+_SETTLED = 1e-9
+_MOST_DAMPING = 1e6
+# What is known before any motion: of shifts from the first sensor, m; of turns nothing, rad.
+_PRIOR = np.array([3.0] * 3 + [3.0] * 3) ** -2
+# Fits that leave this much more, in variances, are another answer; others nearer to it are the
+# same one.
+_OTHER_COST = 25.0
+_OTHER_RAD = 0.2
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Steps:
+    """Motions over k spans of time: first, other: (k, 6), twists of two sensors, m and rad.
+
+    run: (k,), increasing; spans with one number follow each other without a gap.
+    """
+
+    first: F64Array
+    other: F64Array
+    run: I64Array
+
+    def __len__(self) -> int:
+        return len(self.run)
+
+    def take(self, kept: BoolArray) -> Steps:
+        """Some of the steps; what is left out ends a run."""
+        run = np.cumsum(~kept)[kept] + 1_000_000 * self.run[kept]
+        return Steps(self.first[kept], self.other[kept], run)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class HandEye:
+    """first_from_other; covariance: (6, 6) of its shift and turn in the frame of the first sensor,
+    m and rad, where nothing is known of 3 m and 3 rad; steps: that were used; is_unique: whether no
+    other pose explains the motion as well.
+    """
+
+    first_from_other: Pose
+    covariance: F64Array
+    steps: int
+    is_unique: bool
+
+
+def hand_eye(steps: Steps) -> HandEye:
+    """Find the pose of the other sensor from any start."""
+    steps = steps.take(known_rows(steps.first) & known_rows(steps.other))
+    noise = _Noise(_FIRST_SIGMA**2, np.zeros(6))
+    fits = sorted((_fit(steps, start, noise) for start in _STARTS), key=lambda fit: fit.cost)
+    best = fits[0]
+    for _ in range(_ROUNDS):
+        left = _left(steps, best.pose)
+        steps = steps.take(_is_usual(left))
+        noise = _Noise.of(_left(steps, best.pose), steps.run)
+        best = _fit(steps, best.pose, noise)
+    is_unique = all(
+        _angle(fit.pose, best.pose) < _OTHER_RAD or _fit(steps, fit.pose, noise).is_another(best)
+        for fit in fits[1:]
+    )
+    return HandEye(best.pose, best.covariance, len(steps), is_unique)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Fit:
+    pose: Pose
+    covariance: F64Array
+    cost: float
+
+    def is_another(self, best: _Fit) -> bool:
+        """Whether this is the best pose after all, or one that explains less."""
+        return _angle(self.pose, best.pose) < _OTHER_RAD or self.cost > best.cost + _OTHER_COST
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Noise:
+    """Variances (6,) of a step: of errors that stay, and of those that the next step takes back."""
+
+    stays: F64Array
+    returns: F64Array
+
+    @classmethod
+    def of(cls, left: F64Array, run: I64Array) -> _Noise:
+        """Most likely variances of differences (k, c) in runs (k,)."""
+        values, frequency = _transformed(left, run)
+        square = np.maximum((left**2).mean(axis=0), 1e-16) if len(left) else np.full(6, 1e-16)
+        stays, returns = (part.ravel() for part in np.meshgrid(_SHARES, _SHARES, indexing="ij"))
+        variance = stays[:, None] + returns[:, None] * frequency
+        log = np.log(variance).sum(axis=1)
+        found = []
+        for column, scale in zip(values.T, square, strict=True):
+            at = int((log + (column**2 / scale / variance).sum(axis=1)).argmin())
+            found.append((stays[at] * scale, returns[at] * scale))
+        return cls(*np.array(found).T)
+
+    def whiten(self, values: F64Array, run: I64Array) -> F64Array:
+        """Values (k, 6, ...) as independent ones of variance 1."""
+        changed, frequency = _transformed(values, run)
+        variance = self.stays + self.returns * frequency[:, None]
+        shape = (*variance.shape, *(1,) * (values.ndim - 2))
+        white: F64Array = changed / np.sqrt(variance).reshape(shape)
+        return white
+
+
+def _transformed(values: F64Array, run: I64Array) -> tuple[F64Array, F64Array]:
+    """Sine transforms of values (k, ...) of each run, and their frequencies (k,).
+
+    They diagonalise the covariance of differences of white noise, whose variances are the
+    frequencies: 2 - 2 cos(pi j / (n + 1)).
+    """
+    changed, frequency = np.zeros_like(values), np.zeros(len(run))
+    for begin, end in _pieces(run):
+        count = end - begin
+        angle = math.pi * np.arange(1, count + 1) / (count + 1)
+        sines = np.sin(angle[:, None] * np.arange(1, count + 1)) * math.sqrt(2.0 / (count + 1))
+        changed[begin:end] = np.tensordot(sines, values[begin:end], axes=1)
+        frequency[begin:end] = 2.0 - 2.0 * np.cos(angle)
+    return changed, frequency
+
+
+def _pieces(run: I64Array) -> list[tuple[int, int]]:
+    """Bounds of runs, cut to _MOST_STEPS."""
+    bounds = np.flatnonzero(np.diff(run)) + 1
+    begins = np.concatenate([[0], bounds]) if len(run) else bounds
+    ends = np.concatenate([bounds, [len(run)]]) if len(run) else bounds
+    return [
+        (at, min(at + _MOST_STEPS, int(end)))
+        for begin, end in zip(begins, ends, strict=True)
+        for at in range(int(begin), int(end), _MOST_STEPS)
+    ]
+
+
+def _left(steps: Steps, pose: Pose) -> F64Array:
+    """Differences (k, 6) between the motion of the other sensor and what the pose makes of it."""
+    shift, turn = steps.first[:, :3], steps.first[:, 3:]
+    shift = shift + np.cross(turn, pose.position_m)
+    left: F64Array = steps.other - np.concatenate(
+        [np.matmul(shift, pose.rotation), np.matmul(turn, pose.rotation)], axis=1
+    )
+    return left
+
+
+def _jacobian(steps: Steps, pose: Pose) -> F64Array:
+    """Change (k, 6, 6) of the differences with a shift and a turn (from the left) of the pose."""
+    shift, turn = steps.first[:, :3], steps.first[:, 3:]
+    moved = shift + np.cross(turn, pose.position_m)
+    back = pose.rotation.T
+    found = np.zeros((len(steps), 6, 6))
+    # R' exp(-d) a = R' a + R' [a] d
+    found[:, :3, :3] = -np.matmul(back, skew(turn))
+    found[:, :3, 3:] = -np.matmul(back, skew(moved))
+    found[:, 3:, 3:] = -np.matmul(back, skew(turn))
+    return found
+
+
+def _fit(steps: Steps, pose: Pose, noise: _Noise) -> _Fit:
+    """Levenberg-Marquardt from a pose."""
+    damping = 1e-3
+    white, cost = _weighed(steps, pose, noise)
+    normal = np.diag(_PRIOR)
+    for _ in range(_MOST_ITERATIONS):
+        jacobian = noise.whiten(_jacobian(steps, pose), steps.run).reshape(-1, 6)
+        normal = np.matmul(jacobian.T, jacobian) + np.diag(_PRIOR)
+        gradient = np.matmul(jacobian.T, white)
+        gradient[:3] += _PRIOR[:3] * pose.position_m
+        change = -np.linalg.solve(normal + damping * np.diag(np.diag(normal)), gradient)
+        turn = exp_rotation(change[None, 3:])[0]
+        tried = Pose(np.matmul(turn, pose.rotation), pose.position_m + change[:3])
+        tried_white, tried_cost = _weighed(steps, tried, noise)
+        if tried_cost > cost:
+            if damping > _MOST_DAMPING:
+                break
+            damping *= 10.0
+            continue
+        pose, white, cost, damping = tried, tried_white, tried_cost, damping / 10.0
+        if np.abs(change).max() < _SETTLED:
+            break
+    return _Fit(pose, np.linalg.inv(normal), cost)
+
+
+def _weighed(steps: Steps, pose: Pose, noise: _Noise) -> tuple[F64Array, float]:
+    """Differences as independent ones, and the sum of their squares with that of the prior."""
+    white = noise.whiten(_left(steps, pose), steps.run).ravel()
+    return white, float((white**2).sum() + (_PRIOR[:3] * pose.position_m**2).sum())
+
+
+def known_rows(values: F64Array) -> BoolArray:
+    """Mask (k,) of rows (k, c) without NaN."""
+    return np.asarray(np.isfinite(values).all(axis=1), np.bool_)
+
+
+def _is_usual(left: F64Array) -> BoolArray:
+    """Mask (k,) of steps without a difference far beyond the others."""
+    size = np.median(np.abs(left), axis=0) if len(left) else np.zeros(6)
+    return np.asarray((np.abs(left) <= 1.4826 * _MOST_SIGMAS * size + 1e-12).all(axis=1), np.bool_)
+
+
+def _angle(first: Pose, second: Pose) -> float:
+    cosine = (np.trace(np.matmul(first.rotation.T, second.rotation)) - 1.0) / 2.0
+    return math.acos(min(1.0, max(-1.0, float(cosine))))
+
+
+def _turns_of_a_cube() -> list[Pose]:
+    """The 24 rotations that map axes on axes: any rotation is within 63 degrees of one."""
+    found = []
+    for order, signs in product(permutations(range(3)), product((1.0, -1.0), repeat=3)):
+        matrix = np.eye(3)[list(order)] * np.array(signs)[:, None]
+        if np.linalg.det(matrix) > 0.0:
+            found.append(Pose(matrix, np.zeros(3)))
+    return found
+
+
+_STARTS = _turns_of_a_cube()
