@@ -8,6 +8,7 @@ Each lidar measures its own motion from window to window, in its own frame, howe
 from __future__ import annotations
 
 import math
+from collections import deque
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
@@ -16,13 +17,15 @@ import numpy as np
 from mlbatch.arrays import F64Array, I64Array
 from mlbatch.motion.estimate import VelocityEstimator
 from mlbatch.motion.registration import ORIGIN, Cloud, Pose
-from mlbatch.motion.se3 import exp_rotation
+from mlbatch.motion.se3 import exp_rotation, exp_transform, rotated
 from mlbatch.poses.hand_eye import Steps, hand_eye, known_rows
 from mlbatch.poses.surfaces import planes
 from mlbatch.units import NS_PER_S
 
 # A map of 2 s drifts by some mm over 8 s.
 _MAP_WINDOWS = 20
+# Windows before and after one that its motion is interpolated from.
+_REACH = 2
 # More points a window do not make the motion better.
 _MOST_POINTS = 30_000
 # Cells, m, and least cosine between normals, of the direction that stands for upward.
@@ -130,6 +133,8 @@ def poses_from_motion(windows: Iterable[MotionWindow], names: Sequence[str]) -> 
                 for odometry, cloud in zip(odometries, window.clouds, strict=True)
             ]
         )
+    # Of the last windows no motion is known.
+    twists = twists[_REACH:] + twists[:_REACH]
     twist = np.array(twists).reshape(-1, len(names), 6).transpose(1, 0, 2)
     return poses_of_twists(twist, np.array(middle_ns, np.int64), names)
 
@@ -146,30 +151,87 @@ def poses_of_twists(twist: F64Array, middle_ns: I64Array, names: Sequence[str]) 
 
 
 class Odometry:
-    """Motion of one lidar in its own frame, whichever way that is turned."""
+    """Motion of one lidar in its own frame, whichever way that is turned.
+
+    Velocities change within a window, and lidars see their surfaces at different times of it. So
+    the motion is measured twice: with a constant twist in each window, then with the points moved
+    by the curve through the motions around it.
+    """
 
     def __init__(self) -> None:
-        self._estimator = VelocityEstimator(_MAP_WINDOWS)
+        self._rough = VelocityEstimator(_MAP_WINDOWS)
+        self._fine = VelocityEstimator(_MAP_WINDOWS)
         self._upright: F64Array | None = None
-        self._middle_ns: int | None = None
+        # Windows around the one that is measured next, and their motion from the one before.
+        self._around: deque[_Measured] = deque(maxlen=2 * _REACH + 1)
 
     def add(self, cloud: SensorCloud, start_ns: int, end_ns: int) -> F64Array:
-        """Twist (6,) from the middle of the window before, m and rad; NaN where it is unknown."""
+        """Twist (6,) to the window _REACH windows before, from the one before that one.
+
+        Middle to middle, m and rad; NaN where it is unknown.
+        """
         every = -(-len(cloud.stamp_ns) // _MOST_POINTS) or 1
         points_m = np.asarray(cloud.points_m[::every], np.float64)
         if self._upright is None:
             self._upright = _upright(points_m)
         turn = np.eye(3) if self._upright is None else self._upright
         stamps, column = np.unique(cloud.stamp_ns[::every], return_inverse=True)
-        middle_ns = (start_ns + end_ns) // 2
+        middle_ns, period_ns = (start_ns + end_ns) // 2, end_ns - start_ns
         time_s = (stamps - middle_ns) / NS_PER_S
-        cloud_up = Cloud(np.matmul(points_m, turn.T), column, time_s)
-        velocity = self._estimator.add(cloud_up, middle_ns, end_ns - start_ns).velocity
-        gap_s = 0.0 if self._middle_ns is None else (middle_ns - self._middle_ns) / NS_PER_S
-        self._middle_ns = middle_ns
-        if velocity is None:
+        upright = Cloud(np.matmul(points_m, turn.T), column, time_s)
+        velocity = self._rough.add(upright, middle_ns, period_ns).velocity
+        self._around.append(_Measured(upright, middle_ns, velocity))
+        found = self._measure(period_ns)
+        if found is None:
             return np.full(6, np.nan)
-        return gap_s * np.concatenate([np.matmul(part, turn) for part in velocity.reshape(2, 3)])
+        return np.concatenate([np.matmul(part, turn) for part in found.reshape(2, 3)])
+
+    def _measure(self, period_ns: int) -> F64Array | None:
+        """Twist to the window in the middle of those around it."""
+        if len(self._around) <= 2 * _REACH:
+            return None
+        window = self._around[_REACH]
+        curve = self._curve()
+        if curve is None:
+            return None
+        still = Cloud(
+            _moved_along(window.cloud, *curve), np.zeros_like(window.cloud.column), np.zeros(1)
+        )
+        velocity = self._fine.add(still, window.middle_ns, period_ns).velocity
+        gap_s = (window.middle_ns - self._around[_REACH - 1].middle_ns) / NS_PER_S
+        return None if velocity is None else velocity * gap_s
+
+    def _curve(self) -> tuple[F64Array, F64Array] | None:
+        """Times (2 _REACH + 1,) of the windows from that in the middle, and twists to each."""
+        middles = [window.middle_ns for window in self._around]
+        gaps_s = np.diff(middles) / NS_PER_S
+        poses = [ORIGIN]
+        for window, gap_s in zip(list(self._around)[1:], gaps_s, strict=True):
+            if window.velocity is None:
+                return None
+            poses.append(poses[-1].then(window.velocity * gap_s))
+        times_s = (np.array(middles) - middles[_REACH]) / NS_PER_S
+        return times_s, np.array([poses[_REACH].twist_to(pose) for pose in poses])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Measured:
+    """A window; velocity: (6,), from the one before, m/s and rad/s."""
+
+    cloud: Cloud
+    middle_ns: int
+    velocity: F64Array | None
+
+
+def _moved_along(cloud: Cloud, times_s: F64Array, twists: F64Array) -> F64Array:
+    """Points of a window at its middle, by the polynomial through twists (n, 6) at times (n,)."""
+    powers = np.vander(times_s / times_s[-1], increasing=True)
+    factors = np.linalg.solve(powers, twists)
+    at = np.vander(cloud.time_s / times_s[-1], len(times_s), increasing=True)
+    twist = np.matmul(at, factors)
+    rotation, step = exp_transform(twist[:, :3], twist[:, 3:])
+    moved: F64Array = rotated(rotation[cloud.column], cloud.points_m) + step[cloud.column]
+    return moved
 
 
 def _upright(points_m: F64Array) -> F64Array | None:
@@ -232,7 +294,7 @@ def _pose(
     if worst > _MOST_START_RAD:
         refusal = words[len(turns) - 1]
     elif not found.is_unique:
-        refusal = f"{names[1]}: the motion fits poses far from each other; {_INSTEAD}"
+        refusal = f"{names[1]}: the motion fits poses whose axes lie far apart; {_INSTEAD}"
     weak = [np.concatenate([np.zeros(3), way]) for way, _ in turns]
     weak += [np.concatenate([way, np.zeros(3)]) for way, _ in shifts]
     return MotionPose(
