@@ -50,7 +50,9 @@ def chosen_clouds(output: Path, windows: Windows, scans: int | None) -> list[Pag
     chars = [one.chars for one in clouds]
     if sum(chars) > most:
         return read_clouds(output, places, windows, -(-stride * sum(chars) // most))
-    room = (most - sum(chars)) // max(1, *chars, 1)
+    # Other scans may have more points than these, which may be empty.
+    per_point = max((one.chars / max(1, one.total) for one in clouds), default=1.0)
+    room = int((most - sum(chars)) / (per_point * max(1, int(windows.points.max()))))
     if scans is None and room:
         more = choose_places(windows, len(places) + room)
         clouds += read_clouds(output, [one for one in more if one not in places], windows)
@@ -72,7 +74,7 @@ def choose_places(windows: Windows, scans: int) -> list[Place]:
     )
     rows = list(range(len(windows)))
     titles: dict[int, list[str]] = {row: [] for row in rows}
-    for title, row in named:
+    for title, row in named[1:] + named[:1]:
         titles[row].append(title)
     if scans and scans < len(rows):
         kept = list(dict.fromkeys(row for _, row in named))[:scans]

@@ -257,12 +257,12 @@ def _about_clouds(clouds: list[PageCloud], windows: Windows | None) -> str:
     if not clouds or windows is None:
         return ""
     first = clouds[0]
-    kept = "all points" if first.stride == 1 else f"every {_ordinal(first.stride)} column"
+    kept = "all their points" if first.stride == 1 else f"every {_ordinal(first.stride)} column"
     kilobytes = sum(one.chars for one in clouds) / len(clouds) / 1000
     step_mm = max(one.step_m for one in clouds) * 1000
     return (
-        f"{len(clouds):,} of {number(len(windows), 'scan')}, {kept}, {kilobytes:,.0f} kB per scan; "
-        f"coordinates rounded to {step_mm:.0f} mm."
+        f"{len(clouds):,} of {number(len(windows), 'scan')}, with {kept}; {kilobytes:,.0f} kB per "
+        f"scan; coordinates rounded to {step_mm:.0f} mm."
     )
 
 

@@ -265,8 +265,18 @@ class Camera {
     const [right, up, ahead] = ends.map(([low, high]) => (low + high) / 2);
     this.target = cloud.centre.map((one, k) =>
       one + right * this.right[k] + up * this.up[k] + ahead * this.ahead[k]);
-    // At the depth of the middle; what is nearer is larger.
+    // At the depth of the middle; what is nearer is larger, and lower.
     this.distance = Math.max(.5, this.focal * Math.max(wide / this.aspect, high) * 1.1 + deep * .8);
+    const across = [], down = [];
+    this.project(cloud, this.aspect, 1, (i, x, y) => {
+      if (3 * i % every === 0) { across.push(x); down.push(y); }
+    });
+    const middle = (values) => {
+      values.sort((a, b) => a - b);
+      const [low, high] = [.02, .98].map((one) => values[Math.floor(one * (values.length - 1))]);
+      return (low + high) / 2 || 0;
+    };
+    if (down.length) this.pan((this.aspect / 2 - middle(across)) / 2, (middle(down) - .5) / 2);
   }
 }
 

@@ -136,7 +136,7 @@ def test_scans_of_a_page_are_chosen(words: str, count: int, shell: Shell) -> Non
     data = plot_data(Path("page.html"))
     assert len(data["clouds"]) == count
     assert "first" in data["clouds"][data["begin"]]["text"]
-    about = f"{count} of 7 scans, all points"
+    about = f"{count} of 7 scans, with all their points; "
     assert about in Path("page.html").read_text(encoding="utf-8")
 
 
@@ -157,7 +157,7 @@ def test_large_scans_are_thinned_by_whole_columns(
     assert shell("report scans -o page.html").code == 0
     text = Path("page.html").read_text(encoding="utf-8")
     clouds = plot_data(Path("page.html"))["clouds"]
-    assert "2 of 7 scans, every 2nd column" in text
+    assert "2 of 7 scans, with every 2nd column; " in text
     assert f"{POINTS:,} points, {clouds[0]['shown']:,} of them shown" in clouds[0]["text"]
     shown = points_of(clouds[0])
     # Half of the columns of 512 per revolution, with each ring that the scan has.
@@ -181,6 +181,23 @@ def test_a_page_is_full_but_not_beyond(shell: Shell, monkeypatch: pytest.MonkeyP
         rows = [cloud.place.row for cloud in clouds]
         assert rows == sorted(set(rows))
         assert limit - 2 * one.chars < sum(cloud.chars for cloud in clouds) <= limit
+
+
+def test_empty_scans_promise_no_room(shell: Shell, monkeypatch: pytest.MonkeyPatch) -> None:
+    """First, middle and worst have few points; all others together are beyond the limit."""
+    far = "--min-range 13"
+    assert shell(f"convert {FIX} -o scans --quiet").code == 0
+    assert shell(f"convert {FIX} -o none --quiet {far}").code == 0
+    for index in (0, 3):
+        Path(f"none/{index:06}.npz").replace(f"scans/{index:06}.npz")
+    windows = read_windows(Path("scans/scans.csv").read_text(encoding="utf-8"), 1)
+    assert windows is not None
+    (one,) = read_clouds(Path("scans"), choose_places(windows, 7)[1:2], windows)
+    assert one.total == POINTS
+    monkeypatch.setattr("mlbatch.page.clouds._MOST_CHARS", 3 * one.chars)
+    clouds = chosen_clouds(Path("scans"), windows, None)
+    assert 0 < clouds[0].total < 1000
+    assert sum(cloud.chars for cloud in clouds) <= 3 * one.chars
 
 
 FAR = (
