@@ -367,27 +367,39 @@ class _Run:
         for recording in recordings:
             recording.keep = names
         try:
-            with contextlib.closing(self._setup.first.whole(is_without_packets)) as batches:
-                for batch in batches:
-                    if self._is_beyond(batch):
-                        self._is_short = True
-                        break
-                    self._add_messages(batch.messages)
-                    self._add(batch)
-                    if progress is not None:
-                        done = sum(recording.position_bytes for recording in recordings)
-                        progress(done, sum(recording.size_bytes for recording in recordings))
+            self._read_all(recordings, progress)
             if self._bag is not None:
                 for place in self._places.places:
                     last_ns = self._written_ns[1] if self._written_ns else 0
                     for message in place.messages.rest(last_ns) if place.messages else ():
                         self._bag.forward(message)
                 self._forward_until(None)
-        finally:
-            for file in (self._pcap, self._bag):
-                if file is not None:
-                    file.close()
+        except BaseException:
+            # Completing a file may fail as well, perhaps on the disk that is full.
+            with contextlib.suppress(Exception):
+                self._close()
+            raise
+        self._close()
         self._refuse_nothing()
+
+    def _close(self) -> None:
+        for file in (self._pcap, self._bag):
+            if file is not None:
+                file.close()
+
+    def _read_all(
+        self, recordings: Sequence[Recording], progress: Callable[[int, int], object] | None
+    ) -> None:
+        with contextlib.closing(self._setup.first.whole(is_without_packets)) as batches:
+            for batch in batches:
+                if self._is_beyond(batch):
+                    self._is_short = True
+                    return
+                self._add_messages(batch.messages)
+                self._add(batch)
+                if progress is not None:
+                    done = sum(recording.position_bytes for recording in recordings)
+                    progress(done, sum(recording.size_bytes for recording in recordings))
 
     def _is_beyond(self, batch: PacketBatch) -> bool:
         if self._end_ns is None or not len(batch):

@@ -6,6 +6,7 @@ Layouts: draft-ietf-opsawg-pcap; MCAP specification; db schema 3 of rosbag2
 
 from __future__ import annotations
 
+import errno
 import ipaddress
 import struct
 from functools import lru_cache
@@ -208,16 +209,26 @@ class SqliteFile:
             kind = topic.type.replace("/", "/msg/")
             profiles = qos_in_numbers(topic.qos) or qos(topic.latched)
             row = (self._topics[topic], topic.name, kind, topic.encoding, profiles)
-            self._base.execute("INSERT INTO topics VALUES (?, ?, ?, ?, ?)", row)
-        self._base.execute(
+            self._do("INSERT INTO topics VALUES (?, ?, ?, ?, ?)", row)
+        self._do(
             "INSERT INTO messages(topic_id, timestamp, data) VALUES (?, ?, ?)",
             (self._topics[topic], message.host_ns, message.data),
         )
         self._rows += 1
         if self._rows % _COMMIT_ROWS == 0:
-            self._base.commit()
+            self._do("COMMIT")
 
     def close(self) -> None:
         """Complete the file."""
-        self._base.commit()
+        if self._base.in_transaction:
+            self._do("COMMIT")
         self._base.close()
+
+    def _do(self, statement: str, values: tuple[object, ...] = ()) -> None:
+        """Execute a statement; OSError where the file cannot be written."""
+        import sqlite3
+
+        try:
+            self._base.execute(statement, values)
+        except sqlite3.OperationalError as err:
+            raise OSError(errno.EIO, str(err)) from err
