@@ -83,14 +83,14 @@ class HandEye:
 def hand_eye(steps: Steps) -> HandEye:
     """Find the pose of the other sensor from any start."""
     steps = steps.take(known_rows(steps.first) & known_rows(steps.other))
-    noise = _Noise(_FIRST_SIGMA**2, np.zeros(6))
+    noise = Noise(_FIRST_SIGMA**2, np.zeros(6))
     spectrum = _Spectrum.of(steps, noise)
     fits = sorted((_fit(spectrum, start) for start in _STARTS), key=lambda fit: fit.cost)
     best = fits[0]
     for _ in range(_ROUNDS):
         left = _left(steps, best.pose)
         steps = steps.take(_is_usual(left))
-        noise = _Noise.of(_left(steps, best.pose), steps.run)
+        noise = Noise.of(_left(steps, best.pose), steps.run)
         spectrum = _Spectrum.of(steps, noise)
         best = _fit(spectrum, best.pose)
     is_unique = all(
@@ -135,17 +135,17 @@ class _Fit:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Noise:
-    """Variances (6,) of a step: of errors that stay, and of those that the next step takes back."""
+class Noise:
+    """Variances (c,) of a step: of errors that stay, and of those that the next step takes back."""
 
     stays: F64Array
     returns: F64Array
 
     @classmethod
-    def of(cls, left: F64Array, run: I64Array) -> _Noise:
+    def of(cls, left: F64Array, run: I64Array) -> Noise:
         """Most likely variances of differences (k, c) in runs (k,)."""
-        values, frequency = _transformed(left, run)
-        square = np.maximum((left**2).mean(axis=0), 1e-16) if len(left) else np.full(6, 1e-16)
+        values, frequency = transformed(left, run)
+        square = np.maximum((left**2).sum(axis=0) / max(1, len(left)), 1e-16)
         stays, returns = (part.ravel() for part in np.meshgrid(_SHARES, _SHARES, indexing="ij"))
         variance = stays[:, None] + returns[:, None] * frequency
         log = np.log(variance).sum(axis=1)
@@ -155,8 +155,13 @@ class _Noise:
             found.append((stays[at] * scale, returns[at] * scale))
         return cls(*np.array(found).T)
 
+    def variance(self, frequency: F64Array) -> F64Array:
+        """Variances (k, c) of transforms at frequencies (k,)."""
+        found: F64Array = self.stays + self.returns * frequency[:, None]
+        return found
 
-def _transformed(values: F64Array, run: I64Array) -> tuple[F64Array, F64Array]:
+
+def transformed(values: F64Array, run: I64Array) -> tuple[F64Array, F64Array]:
     """Sine transforms of values (k, ...) of each run, and their frequencies (k,).
 
     They diagonalise the covariance of differences of white noise, whose variances are the
@@ -216,12 +221,12 @@ class _Spectrum:
     scale: F64Array
 
     @classmethod
-    def of(cls, steps: Steps, noise: _Noise) -> _Spectrum:
+    def of(cls, steps: Steps, noise: Noise) -> _Spectrum:
         """Transform both motions; the law between them is linear, and so holds on."""
-        first, frequency = _transformed(steps.first, steps.run)
-        other, _ = _transformed(steps.other, steps.run)
-        variance = noise.stays + noise.returns * frequency[:, None]
-        return cls(Steps(first, other, steps.run), 1.0 / np.sqrt(variance))
+        first, frequency = transformed(steps.first, steps.run)
+        other, _ = transformed(steps.other, steps.run)
+        scale = 1.0 / np.sqrt(noise.variance(frequency))
+        return cls(Steps(first, other, steps.run), scale)
 
     def left(self, pose: Pose) -> F64Array:
         """Differences (6 k,)."""
