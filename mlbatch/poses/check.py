@@ -16,7 +16,7 @@ import numpy as np
 
 from mlbatch.arrays import F64Array
 from mlbatch.motion.se3 import log_rotation
-from mlbatch.poses.solve import LEVELS, Cloud, Place, Problem, Solution, State, solve
+from mlbatch.poses.solve import LEVELS, Cloud, Level, Place, Problem, Solution, State, solve
 from mlbatch.poses.surfaces import Planes, shared_cells
 from mlbatch.report.poses import MEASURED, MISFIT, NOT_CHECKED, OFF, PairFigures
 
@@ -61,11 +61,9 @@ class _Watched(Problem):
         super().__init__([place], lidars)
         self.first: list[Planes] = []
 
-    def clouds(
-        self, place: int, state: State, edge_m: float, points: int = 1 << 40
-    ) -> list[Planes]:
-        found = super().clouds(place, state, edge_m, points)
-        self.first = self.first or found
+    def _planes(self, place: int, state: State, level: Level) -> list[list[Planes]]:
+        found = super()._planes(place, state, level)
+        self.first = self.first or [sizes[0] for sizes in found]
         return found
 
 
