@@ -578,6 +578,13 @@ class _Run:
                 if self._bag is not None
                 else f"{source}: {files[0].name} has no place for {count} packets of {size} bytes"
             )
+        for stream in sorted({place.stream for place in places.places if self._pcap is not None}):
+            if stream in self._setup.sampler.table.untimed:
+                notes.append(
+                    f"{self._setup.sampler.table.streams[stream]}: expected the receive time of "
+                    "each packet, found only that of whole messages, which all their packets got; "
+                    "do not convert with --clock host"
+                )
         bare = [lidar.name for lidar in places.lidars if lidar.sensor is None and lidar.written]
         if bare:
             notes.append(f"no calibration of {some(bare, len(bare))} was found: add it to convert")

@@ -23,6 +23,7 @@ from mlbatch.pipeline.job import Job, TimeSegment
 from mlbatch.readers import open_recording
 from mlbatch.types import StreamTable
 from mlbatch.units import NS_PER_S
+from tests.builders.bags import Body, Recorded
 from tests.builders.captures import pcap_bytes, udp_frame
 from tests.builders.four_makers import FOLDER
 from tests.builders.livox import LivoxSpec, point_packets
@@ -49,6 +50,8 @@ FOUR = Job(
     (FOLDER / "four_makers.pcap",), SensorSelection(rig=FOLDER / "rig.yaml"), keep_partial=True
 )
 FRAMES = read_pcap(FIXTURE.recordings[0])
+SCAN = "hesai_lidar/PandarScan"
+CORRECTION = b"\x47\x74\x05\x00"
 LIDAR_PORTS = (7502, 7503)
 # A piece of the fixture, which begins 08:00:00.020.
 BEGIN_NS = 1_777_881_600_200_000_000
@@ -261,6 +264,8 @@ def test_times_of_messages_are_no_times_of_packets(tmp_path: Path) -> None:
     write_metadata(tmp_path)
     source = write_rosbag1(tmp_path / "drive.bag", scans)
     selection = SensorSelection(metadata=(tmp_path / "unit.csv",), identity_extrinsics=True)
+    found = extract(Extraction((source,), tmp_path / "out.pcap", selection))
+    assert any("do not convert with --clock host" in note for note in found.notes)
     for suffix in (".bag", ".mcap"):
         target = tmp_path / f"out{suffix}"
         extract(Extraction((source,), target, selection))
@@ -327,3 +332,34 @@ def test_reading_ends_after_the_end(tmp_path: Path) -> None:
     assert found.written == 712
     assert found.read < 800
     assert found.read == found.written + sum(found.left_out.values())
+
+
+@pytest.mark.parametrize("suffix", TARGETS)
+def test_a_calibration_among_the_packets_becomes_a_file(suffix: str, tmp_path: Path) -> None:
+    """docs/sources/hesai.md section 10: the first message has the angles as a packet."""
+    write_metadata(tmp_path)
+    text = (tmp_path / "unit.csv").read_bytes()
+    packets = packets_of(plain("hesai"))
+    angles = CORRECTION + len(text).to_bytes(4, "little") + text
+    scans = []
+    for at in range(0, len(packets), 40):
+        group = packets[at : at + 40]
+        body = Body("ros1").header(group[-1][0], "").put("I", len(group) + (at == 0))
+        if at == 0:
+            body.time(group[0][0]).blob(angles).put("I", len(text))
+        for host_ns, payload in group:
+            body.time(host_ns).blob(payload).put("I", len(payload))
+        scans.append(Recorded("/a/pandar_packets", SCAN, group[-1][0], body.done()))
+    folder = tmp_path / "out"
+    folder.mkdir()
+    (tmp_path / "in").mkdir()
+    source = write_rosbag1(tmp_path / "in" / "drive.bag", scans)
+    selection = SensorSelection(identity_extrinsics=True)
+    found = extract(Extraction((source,), folder / f"drive{suffix}", selection))
+    assert found.written == len(packets)
+    (path,) = folder.glob("drive.*.csv")
+    assert path.read_bytes() == text
+    job = Job((source,), selection, keep_partial=True)
+    other = replace(job, recordings=(folder / f"drive{suffix}",))
+    expected = [print_of(scan) for scan in in_memory(job).scans]
+    assert [print_of(scan) for scan in in_memory(other).scans] == expected
