@@ -53,9 +53,9 @@ def tables(
                     lines.append(f"| {scene} | {name} | {number} | {_cells(outcomes)} |")
     lines += [
         "",
-        "Both lidars, windows against sweeps joined by the nearest stamp, of the first phase:",
+        "Both lidars, windows against fused sweeps (nearest stamp), from the first scan on:",
         "",
-        "| scene | N | runs | windows, m | heading aligned, m | joined sweeps, m "
+        "| scene | N | runs | windows: drift, m | heading aligned, m | fused: drift, m "
         "| heading aligned, m |",
         "|---|---|---|---|---|---|---|",
     ]
