@@ -133,6 +133,7 @@ def calibrate(
     start: Moment | None = None,
     end: Moment | None = None,
     time_offset: bool = False,
+    from_motion: bool = False,
     html: AnyPath | None = None,
     overwrite: bool = False,
 ) -> Calibration:
@@ -151,12 +152,14 @@ def calibrate(
         align_clocks=align_clocks,
         start=start,
         end=end,
+        from_motion=from_motion,
     )
     return run_calibration(
         job,
         path_of("output", output),
         path_of("html", html),
         time_offset=time_offset,
+        from_motion=from_motion,
         overwrite=overwrite,
     )
 
@@ -167,6 +170,7 @@ def run_calibration(
     html: Path | None,
     *,
     time_offset: bool,
+    from_motion: bool,
     overwrite: bool,
     command: str = "mlbatch.calibrate",
     progress: Progress | None = None,
@@ -176,7 +180,7 @@ def run_calibration(
         check_output(output, overwrite=overwrite)
     if html is not None:
         check_page(html, overwrite=overwrite)
-    found = calibrate_rig(job, time_offset=time_offset, progress=progress)
+    found = calibrate_rig(job, time_offset=time_offset, from_motion=from_motion, progress=progress)
     if output is not None:
         text = rig_text(job, found, output.parent, date.today())
         write_text(output, text)

@@ -67,6 +67,12 @@ def calibrate(
         bool,
         typer.Option("--time-offset", help="Also find the delay of each lidar's timestamps."),
     ] = False,
+    from_motion: Annotated[
+        bool,
+        typer.Option(
+            "--from-motion", help="Begin with poses by the motion of each lidar, without a guess."
+        ),
+    ] = False,
     html: Annotated[
         Path | None,
         typer.Option(help="Also write a page (HTML): before and after.", metavar="FILE"),
@@ -98,6 +104,7 @@ def calibrate(
         align_clocks=align_clocks,
         start=start,
         end=end,
+        from_motion=from_motion,
         shown=long_name,
     )
     with progress_bar("calibrate", is_verbose=verbose) as progress:
@@ -106,6 +113,7 @@ def calibrate(
             output,
             html,
             time_offset=time_offset,
+            from_motion=from_motion,
             overwrite=overwrite,
             command=shlex.join(["mlbatch", *sys.argv[1:]]),
             progress=progress,
@@ -116,9 +124,10 @@ def calibrate(
     typer.echo(paragraph(found.title()))
     for line in table_lines(found.rows()):
         typer.echo(line)
-    typer.echo("")
-    for line in table_lines(found.pair_rows()):
-        typer.echo(line)
+    if found.pairs:
+        typer.echo("")
+        for line in table_lines(found.pair_rows()):
+            typer.echo(line)
     for path in (output, html):
         if path is not None:
             typer.echo(one_line(f"wrote {path}"))

@@ -9,7 +9,7 @@ import numpy as np
 
 from mlbatch.arrays import BoolArray, F32Array, F64Array
 from mlbatch.page.templates import Verdict, render
-from mlbatch.poses.calibration import Calibration
+from mlbatch.poses.calibration import Calibration, View
 from mlbatch.poses.surfaces import Planes, planes, shared_cells
 
 _SIZE = 440
@@ -46,7 +46,9 @@ def calibration_page(title: str, found: Calibration, command: str) -> str:
         verdict=_verdict(found),
         size=_SIZE,
         names=[(_kind(number), lidar.name) for number, lidar in enumerate(found.lidars)],
-        cuts=list(map(_pictures(found), _cuts(found.view.after))),
+        cuts=[]
+        if found.view is None
+        else [_pictures(found.view, cut) for cut in _cuts(found.view.after)],
         lidars=found.rows(),
         pairs=found.pair_rows(),
         command=command,
@@ -54,6 +56,14 @@ def calibration_page(title: str, found: Calibration, command: str) -> str:
 
 
 def _verdict(found: Calibration) -> Verdict:
+    if not found.pairs:
+        return Verdict(
+            "note",
+            "Calibration",
+            "Poses by motion alone",
+            "The lidars share no surfaces that determine their poses, nor any to measure them on.",
+            found.title(),
+        )
     worst = max(found.pairs, key=lambda pair: pair.after.apart_mm)
     heading = (
         f"Surfaces of {worst.first} and {worst.second} are {worst.after.apart_mm:.1f} mm apart, "
@@ -123,23 +133,17 @@ def _half_m(clouds: Clouds, centre_m: F64Array, axis: int) -> float:
     return min(_MOST_HALF_M, max(_LEAST_HALF_M, reach))
 
 
-@dataclass(frozen=True, slots=True)
-class _pictures:
+def _pictures(view: View, cut: _Cut) -> dict[str, object]:
     """Pictures of a cut, before and after, as paths of dots."""
-
-    found: Calibration
-
-    def __call__(self, cut: _Cut) -> dict[str, object]:
-        view = self.found.view
-        across, up, _ = (_AXES[axis] for axis in cut.axes)
-        return {
-            "title": cut.title,
-            "about": f"{across} to the right, {up} up; {2 * cut.half_m:.1f} m wide",
-            "pictures": [
-                ("with the guess", _paths(view.before, cut)),
-                ("calibrated", _paths(view.after, cut)),
-            ],
-        }
+    across, up, _ = (_AXES[axis] for axis in cut.axes)
+    return {
+        "title": cut.title,
+        "about": f"{across} to the right, {up} up; {2 * cut.half_m:.1f} m wide",
+        "pictures": [
+            ("with the guess", _paths(view.before, cut)),
+            ("calibrated", _paths(view.after, cut)),
+        ],
+    }
 
 
 def _paths(clouds: Clouds, cut: _Cut) -> list[tuple[str, str]]:

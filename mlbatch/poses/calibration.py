@@ -15,9 +15,10 @@ import numpy as np
 
 from mlbatch.arrays import F32Array, F64Array
 from mlbatch.errors import RecordingError
-from mlbatch.frames.transforms import from_rpy_deg, rpy_deg
+from mlbatch.frames.transforms import compose, from_rpy_deg, rpy_deg
 from mlbatch.motion.registration import Pose
 from mlbatch.motion.se3 import log_rotation, skew
+from mlbatch.poses.from_motion import MotionPoses
 from mlbatch.poses.places import Places
 from mlbatch.poses.solve import (
     LEVELS,
@@ -118,7 +119,8 @@ class Calibration:
     """Poses of all lidars, and how well they fit.
 
     places: number that the poses were solved on; held_out: number that they were measured on;
-    different: with a view of their own; windows: of the recording; view: a picture.
+    different: with a view of their own; windows: of the recording; steps: windows whose motion
+    was used (--from-motion); view: a picture, None of poses from motion alone.
     """
 
     lidars: tuple[LidarPose, ...]
@@ -127,14 +129,21 @@ class Calibration:
     held_out: int
     different: int
     windows: int
-    view: View
+    view: View | None
+    steps: int = 0
 
     def title(self) -> str:
         """What the poses come from, in a line."""
+        source = (
+            f"{self.places} places, measured on {self.held_out} others, of {self.windows} windows"
+        )
+        if not self.places:
+            source = (
+                f"by motion alone, {self.steps} windows; no surfaces in common to measure it on"
+            )
         return (
-            f"{self.places} places, measured on {self.held_out} others, of {self.windows} windows; "
-            f"{self.lidars[0].name} stays where it is; standard deviations along and about x, y, "
-            "z of the body"
+            f"{source}; {self.lidars[0].name} stays where it is; standard deviations along and "
+            "about x, y, z of the body"
         )
 
     def rows(self) -> list[list[str]]:
@@ -168,6 +177,7 @@ class Calibration:
             "held_out": self.held_out,
             "different": self.different,
             "windows": self.windows,
+            "steps": self.steps,
             "lidars": [
                 {
                     "name": lidar.name,
@@ -230,18 +240,18 @@ def calibrated(
     """
     fitted, held_out = places.fitted(), places.held_out()
     _refuse_few(places, names)
-    # Twists of the guess, if any, are those of no place.
-    begin = None if guess is None else _start(guess, len(fitted))
-    found = find_poses(fitted, len(names), delays=delays, guess=begin)
+    begin = guess or State.start(len(names), 0)
+    found = find_poses(fitted, len(names), delays=delays, guess=_start(begin, len(fitted)))
     _refuse_unseen(found, names)
     _refuse_undetermined(found, names, delays=delays)
     if not delays:
         _refuse_late(fitted, found, names)
-    _refuse_far(_lidar_poses(found, names, poses, 1.0, delays=delays))
+    guessed = _corrected_poses(poses, begin)
+    refined = _corrected_poses(poses, found.state)
+    _refuse_far(names, guessed, refined)
     again = find_poses(held_out, len(names), guess=_start(found.state, len(held_out)))
     twists = again.state.twists
-    start = State.start(len(names), len(held_out))
-    before = _agreements(held_out, _with_twists(start, twists))
+    before = _agreements(held_out, _with_twists(begin, twists))
     after = _agreements(held_out, _with_twists(found.state, twists))
     pairs = tuple(
         LidarPair(names[a], names[b], before[a, b], after[a, b])
@@ -249,18 +259,18 @@ def calibrated(
         if before[a, b].matched or after[a, b].matched
     )
     _refuse_disagreement(pairs)
-    _refuse_apart(found, again, names, poses)
+    _refuse_apart(found, again, names, refined)
     # Places with one view are not independent.
     doubt = max(1.0, len(places.kept) / max(1, places.different))
-    doubt = max(doubt, _disagreement(found, again, poses))
+    doubt = max(doubt, _disagreement(found, again, refined))
     return Calibration(
-        _lidar_poses(found, names, poses, doubt, delays=delays),
+        _lidar_poses(found, names, guessed, refined, doubt, delays=delays),
         pairs,
         len(fitted),
         len(held_out),
         places.different,
         places.windows,
-        _view(held_out, start, found.state, twists),
+        _view(held_out, begin, found.state, twists),
     )
 
 
@@ -274,29 +284,59 @@ def _with_twists(state: State, twists: F64Array) -> State:
     return State(state.corrections, twists, state.delay_s)
 
 
+def motion_poses(first: F64Array, motion: MotionPoses) -> list[F64Array]:
+    """Poses (4, 4) by motion, relative to that of the first lidar."""
+    found = [first]
+    for pose in motion.poses[1:]:
+        own = np.eye(4)
+        own[:3, :3], own[:3, 3] = pose.first_from_lidar.rotation, pose.first_from_lidar.position_m
+        found.append(rounded(compose(first, own)))
+    return found
+
+
+def by_motion(
+    names: Sequence[str], poses: Sequence[F64Array], motion: MotionPoses, windows: int
+) -> Calibration:
+    """Poses (4, 4) that motion alone determines; windows: of the recording."""
+    lidars = [fixed(names[0], poses[0])]
+    turned = np.kron(np.eye(2), poses[0][:3, :3])
+    for name, pose, found in zip(names[1:], poses[1:], motion.poses[1:], strict=True):
+        covariance = np.matmul(np.matmul(turned, found.covariance), turned.T)
+        sigma = np.sqrt(np.diag(covariance))
+        lidars.append(
+            LidarPose(
+                *(name, pose, MM_PER_M * sigma[:3], sigma[3:] / RAD_PER_DEG),
+                *(0.0, 0.0, 0.0, 0.0),
+                is_fixed=False,
+            )
+        )
+    return Calibration(tuple(lidars), (), 0, 0, 0, windows, None, min(motion.steps))
+
+
 # -- figures --------------------------------------------------------------------------------------
 
 
 def _lidar_poses(
-    found: Solution, names: Sequence[str], poses: Sequence[F64Array], doubt: float, *, delays: bool
+    found: Solution,
+    names: Sequence[str],
+    guessed: Sequence[F64Array],
+    refined: Sequence[F64Array],
+    doubt: float,
+    *,
+    delays: bool,
 ) -> tuple[LidarPose, ...]:
     """Poses with standard deviations; doubt: factor of their variances."""
     each = 7 if delays else 6
-    lidars = []
-    for number, (name, old) in enumerate(zip(names, poses, strict=True)):
-        if not number:
-            still = np.zeros(3)
-            lidars.append(LidarPose(name, old, still, still, 0.0, 0.0, 0.0, 0.0, is_fixed=True))
-            continue
-        new = _corrected(old, found.state.corrections[number])
+    lidars = [fixed(names[0], refined[0])]
+    for number in range(1, len(names)):
         at = each * (number - 1)
         covariance = doubt * found.covariance[at : at + each, at : at + each]
-        shift, turn = _spread_at(covariance, old[:3, 3])
-        moved_m, turned_rad = _between(old, new)
+        shift, turn = _spread_at(covariance, refined[number][:3, 3])
+        moved_m, turned_rad = between(guessed[number], refined[number])
         lidars.append(
             LidarPose(
-                name,
-                new,
+                names[number],
+                refined[number],
                 MM_PER_M * shift,
                 turn / RAD_PER_DEG,
                 MM_PER_M * moved_m,
@@ -309,17 +349,34 @@ def _lidar_poses(
     return tuple(lidars)
 
 
-def _corrected(pose: F64Array, correction: Pose) -> F64Array:
-    """A pose (4, 4) after a correction, rounded to the digits that are written."""
-    moved = np.eye(4)
-    moved[:3, :3] = np.matmul(correction.rotation, pose[:3, :3])
-    moved[:3, 3] = np.matmul(correction.rotation, pose[:3, 3]) + correction.position_m
-    origin = [round(value, _DIGITS) + 0.0 for value in moved[:3, 3].tolist()]
-    angles = [round(value, _DIGITS) + 0.0 for value in rpy_deg(moved)]
+def fixed(name: str, pose: F64Array) -> LidarPose:
+    """The first lidar, whose pose (4, 4) all others are relative to."""
+    still = np.zeros(3)
+    return LidarPose(name, pose, still, still, 0.0, 0.0, 0.0, 0.0, is_fixed=True)
+
+
+def _corrected_poses(poses: Sequence[F64Array], state: State) -> list[F64Array]:
+    """Poses (4, 4) after the corrections of a state, the first one as it is."""
+    pairs = zip(poses[1:], state.corrections[1:], strict=True)
+    return [poses[0], *(rounded(corrected(pose, by)) for pose, by in pairs)]
+
+
+def corrected(pose: F64Array, correction: Pose) -> F64Array:
+    """A pose (4, 4) after a correction."""
+    found = np.eye(4)
+    found[:3, :3] = np.matmul(correction.rotation, pose[:3, :3])
+    found[:3, 3] = np.matmul(correction.rotation, pose[:3, 3]) + correction.position_m
+    return found
+
+
+def rounded(pose: F64Array) -> F64Array:
+    """A pose (4, 4) with the digits that are written."""
+    origin = [round(value, _DIGITS) + 0.0 for value in pose[:3, 3].tolist()]
+    angles = [round(value, _DIGITS) + 0.0 for value in rpy_deg(pose)]
     return from_rpy_deg(origin, angles)
 
 
-def _between(one: F64Array, other: F64Array) -> tuple[float, float]:
+def between(one: F64Array, other: F64Array) -> tuple[float, float]:
     """Distance of the origins of two poses (4, 4), m, and the angle between them, rad."""
     turn = log_rotation(np.matmul(other[:3, :3], one[:3, :3].T)[None])[0]
     return float(np.linalg.norm(other[:3, 3] - one[:3, 3])), float(np.linalg.norm(turn))
@@ -405,8 +462,16 @@ def _disagreement(found: Solution, again: Solution, poses: Sequence[F64Array]) -
 # -- refusals -------------------------------------------------------------------------------------
 
 
+class Undetermined(RecordingError):
+    """Surfaces that do not determine the poses; their motion may."""
+
+
 def _refused(expected: str, found: str, remedy: str) -> RecordingError:
     return RecordingError(f"calibrate: expected {expected}, found {found}; {remedy}")
+
+
+def _undetermined(expected: str, found: str, remedy: str) -> Undetermined:
+    return Undetermined(str(_refused(expected, found, remedy)))
 
 
 def _refuse_few(places: Places, names: Sequence[str]) -> None:
@@ -433,7 +498,7 @@ def _refuse_unseen(found: Solution, names: Sequence[str]) -> None:
                 joined |= {a, b}
     for number, name in enumerate(names):
         if number not in joined:
-            raise _refused(
+            raise _undetermined(
                 f"surfaces that {name} and {names[0]} both see",
                 "none, or too few, that fit together",
                 f"correct the guess if it is more than {MOST_OFF_DEG:g} degrees or {MOST_OFF_M:g} "
@@ -467,7 +532,7 @@ def _refuse_undetermined(found: Solution, names: Sequence[str], *, delays: bool)
             if sigma > _MOST_DELAY_SIGMA_S and f"{name}: its delay" not in directions:
                 directions.append(f"{name}: its delay")
     if directions:
-        raise _refused(
+        raise _undetermined(
             "surfaces that fix the poses in every direction",
             f"none that fix {'; '.join(directions)}",
             _record_instead(directions),
@@ -523,16 +588,17 @@ def _record_instead(directions: Sequence[str]) -> str:
     return f"also record {', and '.join(found)}, seen by both lidars at the same time"
 
 
-def _refuse_far(lidars: Sequence[LidarPose]) -> None:
-    for lidar in lidars:
-        if (
-            lidar.moved_mm > _RESERVE * MM_PER_M * MOST_OFF_M
-            or lidar.turned_deg > _RESERVE * MOST_OFF_DEG
-        ):
+def _refuse_far(
+    names: Sequence[str], guessed: Sequence[F64Array], refined: Sequence[F64Array]
+) -> None:
+    for name, before, after in zip(names, guessed, refined, strict=True):
+        moved_m, turned_rad = between(before, after)
+        turned_deg = turned_rad / RAD_PER_DEG
+        if moved_m > _RESERVE * MOST_OFF_M or turned_deg > _RESERVE * MOST_OFF_DEG:
             raise _refused(
-                f"a guess of {lidar.name} within {MOST_OFF_DEG:g} degrees and {MOST_OFF_M:g} m",
-                f"poses that fit {lidar.turned_deg:.0f} degrees and {lidar.moved_mm / 1000:.1f} m "
-                "away, which may be another wall",
+                f"a guess of {name} within {MOST_OFF_DEG:g} degrees and {MOST_OFF_M:g} m",
+                f"poses that fit {turned_deg:.0f} degrees and {moved_m:.1f} m away, which may be "
+                "another wall",
                 "correct the guess, or give --from-motion",
             )
 

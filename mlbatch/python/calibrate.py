@@ -3,12 +3,17 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Generator
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from dataclasses import replace
 from datetime import date
 from pathlib import Path
 
-from mlbatch.errors import ExportError, NoScanError, RigError, UsageError
+import numpy as np
+
+from mlbatch.arrays import F64Array
+from mlbatch.errors import ExportError, NoScanError, RecordingError, RigError, UsageError
+from mlbatch.frames.transforms import compose, inverse
+from mlbatch.motion.registration import Pose
 from mlbatch.pipeline.conversion import Conversion, Progress
 from mlbatch.pipeline.job import Job
 from mlbatch.poses.calibration import (
@@ -16,10 +21,16 @@ from mlbatch.poses.calibration import (
     MOST_OFF_M,
     Calibration,
     LidarPose,
+    Undetermined,
+    by_motion,
     calibrated,
+    motion_poses,
     numbers,
+    rounded,
 )
+from mlbatch.poses.from_motion import MotionWindow, SensorCloud, poses_from_motion
 from mlbatch.poses.places import LEAST_RANGE_M, MOST_RANGE_M, Places, places_of
+from mlbatch.poses.solve import State
 from mlbatch.python.options import Moment, Names, Paths, session_job, window_job
 from mlbatch.rig.rig import Rig, RigSensor, UnknownExtrinsics, read_rig
 from mlbatch.rig.write import write_rig
@@ -41,10 +52,12 @@ def calibrate_job(
     only: Names = (),
     start: Moment | None = None,
     end: Moment | None = None,
+    from_motion: bool = False,
     shown: Callable[[str], str] = str,
 ) -> Job:
     """The job whose scans a calibration reads; shown: the name of an option in errors."""
-    _refuse_unknown(rig)
+    if not from_motion:
+        _refuse_unknown(rig)
     session = session_job(
         recordings,
         {
@@ -53,11 +66,13 @@ def calibrate_job(
             "clock": clock,
             "align_clocks": align_clocks,
             "only": only,
+            "identity_extrinsics": from_motion,
         },
         shown,
     )
     job = window_job(session, {"rate": _RATE, "start": start, "end": end}, shown)
-    return replace(job, min_range_m=LEAST_RANGE_M, max_range_m=MOST_RANGE_M)
+    # It checks nothing that a calibration does not measure.
+    return replace(job, min_range_m=LEAST_RANGE_M, max_range_m=MOST_RANGE_M, checks_poses=False)
 
 
 def _refuse_unknown(rig: Path) -> None:
@@ -66,14 +81,22 @@ def _refuse_unknown(rig: Path) -> None:
             raise RigError(
                 f"{sensor.extrinsics.place}: expected a guess of the pose of {sensor.name}, within "
                 f"{MOST_OFF_DEG:g} degrees and {MOST_OFF_M:g} m, found unknown; give translation_m "
-                "and rotation_rpy_deg as a tape measure shows them"
+                "and rotation_rpy_deg as a tape measure shows them, or --from-motion"
             )
 
 
 def calibrate(
-    job: Job, *, time_offset: bool = False, progress: Progress | None = None
+    job: Job,
+    *,
+    time_offset: bool = False,
+    from_motion: bool = False,
+    progress: Progress | None = None,
 ) -> Calibration:
-    """Refine the poses of the rig of a job; MlbatchError where they are not determined."""
+    """Refine the poses of the rig of a job; MlbatchError where they are not determined.
+
+    from_motion: begin with poses by the motion of each lidar; where the lidars share no surfaces
+    that determine their poses, these are the result.
+    """
     if time_offset and job.align_clocks_to:
         raise UsageError(
             "--time-offset: expected clocks as recorded, whose offsets a rig can keep, found "
@@ -87,13 +110,48 @@ def calibrate(
             "of all, and a rig with all of them"
         )
     poses = [sensor.pose.body_from_sensor for sensor in run.session.setup.sensors]
+    if not from_motion:
+        return calibrated(_places(run, progress), names, poses, delays=time_offset)
+    with contextlib.closing(_scans(run, progress)) as scans:
+        motion = poses_from_motion(_motion_windows(scans, poses), names)
+    if motion.refusal:
+        raise RecordingError(f"calibrate: {motion.refusal}")
+    moved = motion_poses(poses[0], motion)
+    guess = State.start(len(names), 0)
+    guess.corrections = [
+        Pose(found[:3, :3], found[:3, 3])
+        for found in (compose(new, inverse(old)) for new, old in zip(moved, poses, strict=True))
+    ]
+    places = _places(Conversion(job), progress)
+    try:
+        return calibrated(places, names, poses, delays=time_offset, guess=guess)
+    except Undetermined:
+        if motion.undetermined or time_offset:
+            raise
+        return by_motion(names, moved, motion, places.windows)
+
+
+def _places(run: Conversion, progress: Progress | None) -> Places:
+    """The places of a run; none where it has no whole window."""
+    lidars = len(run.sensors)
     try:
         with contextlib.closing(_scans(run, progress)) as scans:
-            places = places_of(scans, len(names))
+            return places_of(scans, lidars)
     except NoScanError:
         # Its remedies are for outputs.
-        places = Places([], 0, 0, [0] * len(names))
-    return calibrated(places, names, poses, delays=time_offset)
+        return Places([], 0, 0, [0] * lidars)
+
+
+def _motion_windows(scans: Iterable[Scan], poses: Sequence[F64Array]) -> Iterator[MotionWindow]:
+    """The points of each lidar as it measured them; poses: (4, 4) that they were converted with."""
+    for scan in scans:
+        stamp_ns = scan.time_ns.astype(np.int64) + scan.start_ns
+        clouds = []
+        for lidar, pose in enumerate(poses):
+            rows = scan.lidar_id == lidar
+            off_m = scan.xyz[rows].astype(np.float64) - pose[:3, 3]
+            clouds.append(SensorCloud(np.matmul(off_m, pose[:3, :3]), stamp_ns[rows]))
+        yield MotionWindow(scan.start_ns, scan.end_ns, clouds)
 
 
 def _scans(run: Conversion, progress: Progress | None) -> Generator[Scan, None, None]:
@@ -136,13 +194,13 @@ def _rig_path(job: Job) -> Path:
 
 def _refined(sensor: RigSensor, lidar: LidarPose, job: Job) -> RigSensor:
     """A sensor of the rig with what was found."""
-    if lidar.is_fixed:
+    if lidar.is_fixed and not isinstance(sensor.extrinsics, UnknownExtrinsics):
         return sensor
     delay_ns = round(lidar.delay_ms * NS_PER_MS)
     clock = "host" if delay_ns and job.selection.host_clock else sensor.clock
     return replace(
         sensor,
-        extrinsics=lidar.body_from_sensor,
+        extrinsics=rounded(lidar.body_from_sensor),
         extrinsics_files=(),
         offset_ns=sensor.offset_ns + delay_ns,
         clock=clock,

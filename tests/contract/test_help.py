@@ -45,7 +45,8 @@ OPTIONS: dict[str, set[str]] = {
         "simulate": "output duration seed overwrite quiet",
         "schema": "",
         "calibrate": """
-            rig output metadata only clock align-clocks start end time-offset html overwrite
+            rig output metadata only clock align-clocks start end time-offset
+            from-motion html overwrite
             json verbose
         """,
         "digest": "output against overwrite",
