@@ -125,9 +125,16 @@ def calibrate(
     places = _places(Conversion(job), progress)
     try:
         return calibrated(places, names, poses, delays=time_offset, guess=guess)
-    except Undetermined:
-        if motion.undetermined or time_offset:
+    except Undetermined as err:
+        if time_offset:
             raise
+        if motion.undetermined:
+            # Each ends with the same remedy.
+            words = [direction.partition("; ") for direction in motion.undetermined]
+            raise Undetermined(
+                "calibrate: expected surfaces in common or motion that fix the poses, found "
+                f"neither: {'; '.join(word for word, _, _ in words)}; {words[-1][2]}"
+            ) from err
         return by_motion(names, moved, motion, places.windows)
 
 

@@ -5,6 +5,7 @@ The truth is the rig that the simulation writes; guesses are off by a known turn
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from datetime import date
 from pathlib import Path
@@ -15,19 +16,22 @@ import pytest
 import mlbatch
 from mlbatch.arrays import F64Array
 from mlbatch.errors import RecordingError, UsageError
-from mlbatch.frames.transforms import compose, from_rpy_deg
+from mlbatch.frames.transforms import compose, from_rpy_deg, inverse
+from mlbatch.motion.registration import ORIGIN, Pose
 from mlbatch.motion.se3 import log_rotation
-from mlbatch.poses.calibration import Calibration, LidarPose
+from mlbatch.poses.calibration import Calibration, LidarPose, by_motion, motion_poses
+from mlbatch.poses.from_motion import MotionPose, MotionPoses
 from mlbatch.python.calibrate import calibrate_job, rig_text
 from mlbatch.rig.rig import Rig, read_rig
 from mlbatch.rig.write import write_rig
-from tests.builders.simulated import Recorded, record, scenario_text
+from tests.builders.simulated import MOTION, Recorded, record, scenario_text
 
 _SENSOR = (
     "  - {{name: {0}, model: OS0-32, columns: 512, "
     "extrinsics: {{translation_m: [0.1, {1}, 0.2], rotation_rpy_deg: [0, 10, {2}]}}}}\n"
 )
 SENSORS = _SENSOR.format("left", 0.3, 60) + _SENSOR.format("right", -0.3, -60)
+_NO_AXES = np.zeros((6, 0))
 # Guesses of the right lidar: turns about fixed axes in degrees, shifts in m, both of the body.
 GUESSES = {
     "20 degrees about z, 1 m": ([0.8, 0.6, 0.0], [0.0, 0.0, 20.0]),
@@ -196,3 +200,50 @@ def test_delays_become_offsets_of_the_clock(
         0,
         -12_500_000,
     ]
+
+
+# -- without a guess ------------------------------------------------------------------------------
+
+
+def _unknown(rig: Path) -> Path:
+    """The rig without poses."""
+    text = re.sub("extrinsics: .*", "extrinsics: unknown", rig.read_text(encoding="utf-8"))
+    found = rig.with_name("unknown.yaml")
+    found.write_text(text, encoding="utf-8")
+    return found
+
+
+def test_motion_needs_no_guess(tmp_path: Path) -> None:
+    """Poses are relative to the first lidar, whose frame is the body frame."""
+    # Thirty windows of motion are needed.
+    head, sway = MOTION.split("  sway:")
+    motion = f"{head}    - [5, -0.8, 0.2, 1.2, 320]\n  sway:{sway}"
+    drive = record(tmp_path, scenario_text(SENSORS, motion=motion, duration=4.5))
+    rig = tmp_path / "rig.yaml"
+    left, right = mlbatch.calibrate(drive.path, _unknown(drive.rig), rig, from_motion=True).lidars
+    true = read_rig(drive.rig)
+    relative = compose(inverse(true_pose(true, "left")), true_pose(true, "right"))
+    error_mm, error_deg = off(right, relative)
+    assert np.abs(left.body_from_sensor - np.eye(4)).max() == 0
+    assert np.abs(error_mm).max() < 5
+    assert np.abs(error_deg).max() < 0.05
+    assert true_pose(read_rig(rig), "right").tobytes() == right.body_from_sensor.tobytes()
+
+
+def test_too_little_motion_gives_no_pose(room: Recorded) -> None:
+    with pytest.raises(RecordingError, match="calibrate: right: expected 30 windows"):
+        mlbatch.calibrate(room.path, _unknown(room.rig), from_motion=True)
+
+
+def test_deviations_of_motion_are_those_along_the_body() -> None:
+    """The first lidar is turned by 90 degrees: its x axis is y of the body."""
+    sigma = np.array([0.001, 0.002, 0.003, 0.01, 0.02, 0.03])
+    own = MotionPose(Pose(np.eye(3), np.array([1.0, 0, 0])), np.diag(sigma**2), _NO_AXES, (), "")
+    still = MotionPose(ORIGIN, np.zeros((6, 6)), _NO_AXES, (), "")
+    motion = MotionPoses((still, own), (40, 38), np.zeros(40, np.int64), np.zeros((2, 40, 6)))
+    poses = motion_poses(from_rpy_deg([0, 0, 2], [0, 0, 90]), motion)
+    assert poses[1][:3, 3] == pytest.approx([0, 1, 2])
+    found = by_motion(["left", "right"], poses, motion, 44)
+    assert (found.steps, found.windows, found.pairs) == (38, 44, ())
+    assert found.lidars[1].sigma_mm == pytest.approx([2, 1, 3])
+    assert found.lidars[1].sigma_deg == pytest.approx(np.rad2deg([0.02, 0.01, 0.03]))
