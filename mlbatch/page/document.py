@@ -128,7 +128,7 @@ def _clouds(source: Source, windows: Windows | None) -> tuple[list[PageCloud], s
 
 
 def _verdict(report: RunReport, found: list[Finding], windows: Windows | None) -> Verdict:
-    level, heading, others = verdict(found)
+    level, heading, others = verdict(found, report)
     sensors = report.sensors
     names = ", ".join(sensor.name for sensor in sensors)
     scans = number(report.scans.written, "scan")

@@ -65,8 +65,7 @@ REMEDIES = {
 _INFORMATION = frozenset({"clouds", "constant_tf"})
 _SERIOUS = frozenset({"clocks", "clock_jump", "cut_off", "recording", "clock_epoch"})
 
-# Poses are numbers that no packet contradicts.
-_FINE = "Packets, windows and clocks are fine; poses not checked"
+_FINE = "Packets, windows and clocks are fine"
 # Shares of packets or columns.
 _LITTLE, _MUCH = 0.001, 0.01
 # Distance that clocks drift apart during the recording.
@@ -101,17 +100,20 @@ def findings(report: RunReport, windows: Windows | None) -> list[Finding]:
         *_packets(report),
         *_columns(report),
         *_clocks(report),
+        *_poses(report),
         *_faults(report),
         *_warnings(report),
     ]
     return sorted(found, key=lambda one: -one.level)
 
 
-def verdict(found: list[Finding]) -> tuple[Level, str, str]:
+def verdict(found: list[Finding], report: RunReport) -> tuple[Level, str, str]:
     """The overall level, a heading, and the number of other findings in words."""
     level = max((one.level for one in found), default=Level.GOOD)
     if level < Level.WARNING:
-        return Level.GOOD, _FINE, ""
+        # Where lidars are, no packet says: the heading names what was compared.
+        poses = "poses not checked" if report.poses is None else report.poses.describe()
+        return Level.GOOD, f"{_FINE}; {poses}", ""
     problems = sum(one.level == Level.PROBLEM for one in found)
     warnings = sum(one.level == Level.WARNING for one in found)
     parts = [number(problems, "problem")] * (problems > 0)
@@ -271,6 +273,15 @@ def _clocks(report: RunReport) -> Iterator[Finding]:
         f"{recorded_s:.0f} s."
     )
     yield Finding(level, text, REMEDIES["clocks"])
+
+
+def _poses(report: RunReport) -> Iterator[Finding]:
+    """What lidars see in common; poses that are wrong have a warning."""
+    pairs = () if report.poses is None else report.poses.pairs
+    for pair in pairs:
+        if not pair.is_wrong:
+            text = pair.describe()
+            yield Finding(Level.NOTE, f"Poses: {text}.")
 
 
 def _faults(report: RunReport) -> Iterator[Finding]:

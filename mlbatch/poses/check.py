@@ -16,7 +16,17 @@ import numpy as np
 
 from mlbatch.arrays import F64Array
 from mlbatch.motion.se3 import log_rotation
-from mlbatch.poses.solve import LEVELS, Cloud, Level, Place, Problem, Solution, State, solve
+from mlbatch.poses.solve import (
+    LEVELS,
+    Cloud,
+    Level,
+    Place,
+    Problem,
+    Solution,
+    State,
+    estimate,
+    solve,
+)
 from mlbatch.poses.surfaces import Planes, shared_cells
 from mlbatch.report.poses import MEASURED, MISFIT, NOT_CHECKED, OFF, PairFigures
 
@@ -29,8 +39,9 @@ _MOST_SIGMA_M = 0.015
 _MOST_SIGMA_RAD = float(np.deg2rad(0.15))
 # Places that agree, at least.
 _LEAST_PLACES = 2
-# Places are compared until so many were, or none is left; enough if all is clear.
+# Places are compared until so many were; enough if all is clear, and if nothing is in common.
 _MOST_PLACES = 6
+_CLEAR_PLACES = 2
 _ENOUGH = 3
 # Points of a cloud that are used, and where few surfaces are matched, all.
 _POINTS = 11_000
@@ -48,6 +59,10 @@ _UNKNOWN_M2 = 1e4
 _FLOOR_M = 0.001
 _FLOOR_RAD = float(np.deg2rad(0.005))
 _COARSE, _MIDDLE, _FINE = LEVELS
+# Motion between windows, in about this time, beyond which one step is too little, m.
+_BETWEEN_S = 0.1
+_FAST_M = 0.05
+_LINEAR_M = 0.5
 # Steps at each level where something seems to be off.
 _STEPS = 8
 # An axis is named if the direction is within 25 degrees of it.
@@ -65,6 +80,10 @@ class _Watched(Problem):
         found = super()._planes(place, state, level)
         self.first = self.first or [sizes[0] for sizes in found]
         return found
+
+    def start(self) -> State:
+        """Poses as converted, at rest."""
+        return State.start(self.lidars, 1)
 
 
 @dataclass(slots=True)
@@ -118,41 +137,70 @@ class PoseComparison:
         self._estimates: list[_Estimate] = []
         # Of places where something seems to be off.
         self._kept: list[Place] = []
+        # Whether planes of some points were too little.
+        self._needs_stems = False
+        self._needs_all = False
 
     @property
     def is_settled(self) -> bool:
         """Whether more places would add nothing."""
+        if self.places < _CLEAR_PLACES:
+            return False
         if self.places >= _MOST_PLACES:
             return True
-        return self.places >= _ENOUGH and all(map(self._is_clear, self._measured()))
+        pairs = self._measured()
+        if self.places >= _ENOUGH and not any(pair.surfaces for pair in pairs):
+            return True
+        return all(map(self._is_clear, pairs))
 
     def add(self, place: Place) -> None:
         """Compare the clouds of a place: a cloud of each lidar in a window, then in the next."""
         self.places += 1
-        lidars = len(self._names)
-        problem = _Watched([_thinned(cloud) for cloud in place], lidars)
-        solution = solve(problem, State.start(lidars, 1), _MIDDLE, most_steps=1)
-        window = problem.first[:lidars]
+        few = [self._reduced(cloud) for cloud in place]
+        problem, solution = self._solved(few)
+        if solution.weak.shape[1] and not self._needs_stems:
+            self._needs_stems = True
+            problem, solution = self._solved([self._reduced(cloud) for cloud in place])
+        misfit = self._count(problem.first)
+        matched = sum(count for (one, other), count in solution.matched.items() if one != other)
+        if not self._needs_all and 0 < matched < _FEW_SURFACES:
+            self._needs_all = True
+            problem, solution = self._solved(place)
+        found = _estimate(solution)
+        is_off = misfit or (found is not None and _seems_off(found))
+        if is_off or found is None:
+            self._kept = [*self._kept, place][-_ENOUGH:]
+        if is_off:
+            state = solve(problem, problem.start(), _COARSE, _STEPS).state
+            found = _estimate(solve(problem, state, _MIDDLE, _STEPS))
+        if found is not None:
+            self._estimates.append(found)
+
+    def _reduced(self, cloud: Cloud) -> Cloud:
+        """What is used of a cloud: as much as the places so far needed."""
+        step = 1 if self._needs_all else max(1, len(cloud.points_m) // _POINTS)
+        origin_m = cloud.origin_m if self._needs_stems else None
+        return Cloud(cloud.lidar, cloud.points_m[::step], cloud.time_s[::step], origin_m)
+
+    def _solved(self, place: Place) -> tuple[_Watched, Solution]:
+        """Corrections by one step, or where the machine is fast by more."""
+        level = _FINE if self._needs_all else _MIDDLE
+        problem = _Watched(place, len(self._names))
+        solution = estimate(problem, problem.start(), level)
+        if float(np.abs(solution.state.twists).max(initial=0.0)) * _BETWEEN_S > _FAST_M:
+            solution = solve(problem, solution.state, level, most_steps=2)
+        return problem, solution
+
+    def _count(self, surfaces: Sequence[Planes]) -> bool:
+        """Count the surfaces of the first window; return whether those of a pair do not fit."""
         misfit = False
         for (one, other), pair in self._pairs.items():
             now = _Pair()
-            now.add(window[one], window[other])
+            now.add(surfaces[one], surfaces[other])
             misfit |= now.both >= _LEAST_SURFACES and now.fit < _FITS * now.both
             pair.both, pair.fewer = pair.both + now.both, pair.fewer + now.fewer
             pair.fit += now.fit
-        matched = sum(count for (one, other), count in solution.matched.items() if one != other)
-        if matched < _FEW_SURFACES:
-            problem = _Watched(place, lidars)
-            solution = solve(problem, State.start(lidars, 1), _FINE, most_steps=3)
-        estimate = _estimate(solution)
-        is_off = misfit or (estimate is not None and _seems_off(estimate))
-        if is_off or estimate is None:
-            self._kept = [*self._kept, place][-_ENOUGH:]
-        if is_off:
-            state = solve(problem, State.start(lidars, 1), _COARSE, _STEPS).state
-            estimate = _estimate(solve(problem, state, _MIDDLE, _STEPS))
-        if estimate is not None:
-            self._estimates.append(estimate)
+        return misfit
 
     def figures(self) -> tuple[PairFigures, ...]:
         """What is known of each pair."""
@@ -162,7 +210,8 @@ class PoseComparison:
         return tuple(map(self._with_swapped, self._pairs, found))
 
     def _with_swapped(self, key: tuple[int, int], pair: PairFigures) -> PairFigures:
-        if pair.outcome == MEASURED or not self._fits_swapped(key):
+        is_clear = pair.outcome == MEASURED and not pair.undetermined
+        if is_clear or not self._fits_swapped(key, is_whole=not pair.is_wrong):
             return pair
         # That they fit with all directions determined is proof, too.
         outcome = pair.outcome if pair.is_wrong else MISFIT
@@ -185,7 +234,7 @@ class PoseComparison:
     def _figures(self, key: tuple[int, int], pair: _Pair, joined: _Estimate | None) -> PairFigures:
         names = self._names[key[0]], self._names[key[1]]
         if not pair.both:
-            return PairFigures(names, NOT_CHECKED, "they see nothing in common")
+            return PairFigures(names, NOT_CHECKED, "the lidars see nothing in common")
         figures = PairFigures(
             names,
             NOT_CHECKED,
@@ -195,15 +244,15 @@ class PoseComparison:
             fit_percent=round(100 * pair.fit / pair.both, 1),
         )
         if pair.both < _LEAST_SURFACES * min(self.places, _LEAST_PLACES):
-            return figures._replace(reason=f"they have {pair.both} surfaces in common, too few")
+            return figures._replace(reason=f"they have only {pair.both} surfaces in common")
         if pair.fit < _MISFIT * pair.both and self.places >= _LEAST_PLACES:
             return figures._replace(outcome=MISFIT)
         if joined is None:
-            return figures._replace(reason="what they see in common determines nothing")
+            return figures._replace(reason="what they see in common determines no direction")
         shift = self._part(key, joined, turn=False)
         turn = self._part(key, joined, turn=True)
         if shift.size is None and turn.size is None:
-            return figures._replace(reason="what they see in common determines nothing")
+            return figures._replace(reason="what they see in common determines no direction")
         is_off = shift.is_proven or turn.is_proven
         if not is_off and (shift.is_beyond or turn.is_beyond):
             return figures._replace(reason="what is seen in one place contradicts the others")
@@ -265,8 +314,11 @@ class PoseComparison:
                 found[:, 6 * (lidar - 1) : 6 * lidar] += sign * six
         return found
 
-    def _fits_swapped(self, key: tuple[int, int]) -> bool:
-        """Whether surfaces fit with the poses of two lidars exchanged."""
+    def _fits_swapped(self, key: tuple[int, int], *, is_whole: bool) -> bool:
+        """Whether surfaces fit with the poses of two lidars exchanged.
+
+        is_whole: all directions have to be determined.
+        """
         one, other = (self._poses[lidar] for lidar in key)
         moves = {key[0]: other @ np.linalg.inv(one), key[1]: one @ np.linalg.inv(other)}
         poses = list(self._poses)
@@ -283,6 +335,7 @@ class PoseComparison:
             and figures.turn_deg is not None
             and figures.fit_percent >= 100 * _FITS
             and self._is_clear(figures)
+            and not (is_whole and figures.undetermined)
         )
 
 
@@ -295,12 +348,6 @@ class _Part:
     is_beyond: bool = False
     is_proven: bool = False
     undetermined: tuple[str, ...] = field(default=())
-
-
-def _thinned(cloud: Cloud) -> Cloud:
-    """Some of the points of a cloud."""
-    step = max(1, len(cloud.points_m) // _POINTS)
-    return Cloud(cloud.lidar, cloud.points_m[::step], cloud.time_s[::step], cloud.origin_m)
 
 
 def _moved(cloud: Cloud, move: F64Array | None) -> Cloud:
@@ -354,7 +401,9 @@ def _seems_off(estimate: _Estimate) -> bool:
     """Whether a linear estimate is near a limit, or beyond."""
     variance, axes = np.linalg.eigh(estimate.covariance)
     along = np.abs(np.matmul(axes.T, estimate.value))
-    return bool((along > np.maximum(LIMIT_M / 2, 3 * np.sqrt(variance))).any())
+    is_off = along > np.maximum(LIMIT_M / 2, 3 * np.sqrt(variance))
+    # Beyond, one linear step says nothing.
+    return bool(is_off.any() or np.abs(estimate.value).max() > _LINEAR_M)
 
 
 def _axis_name(direction: F64Array) -> str:

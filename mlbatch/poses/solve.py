@@ -9,7 +9,7 @@ a small motion of its points in the body frame, after the pose that they were co
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations
 
 import numpy as np
@@ -288,6 +288,27 @@ def solve(problem: Problem, state: State, level: Level, most_steps: int = 25) ->
             break
     covariance, weak = equations.determined()
     return Solution(state, covariance, weak, equations.matched(), equations.rms, converged)
+
+
+def estimate(problem: Problem, state: State, level: Level, steps: int = 3) -> Solution:
+    """Steps from a state with surfaces matched once, and residuals that change linearly."""
+    rows = problem.rows(state, level)
+    equations = _Equations(problem, rows, state)
+    for _ in range(steps):
+        step = equations.step()
+        state = _after(problem, state, step)
+        twists = step[problem.poses :].reshape(-1, 6)
+        rows = [
+            replace(
+                part,
+                residual=part.residual
+                + np.matmul(part.jacobian, np.concatenate([step[: problem.poses], twist])),
+            )
+            for part, twist in zip(rows, twists, strict=True)
+        ]
+        equations = _Equations(problem, rows, state)
+    covariance, weak = equations.determined()
+    return Solution(state, covariance, weak, equations.matched(), equations.rms, False)
 
 
 def find_poses(

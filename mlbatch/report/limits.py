@@ -8,32 +8,51 @@ from functools import partial
 from typing import NamedTuple, TypeAlias
 
 from mlbatch.errors import UsageError
+from mlbatch.report.poses import MISFIT
 from mlbatch.report.report import ACCEPTED_WARNINGS, CUT_OFF, RunReport
 
 # A part and the whole that it is a share of; 0: it is a share of nothing.
 Amount: TypeAlias = tuple[int, int]
 
-_LIMIT = r"\s*([a-z_]+)\s*>\s*(\d+(?:\.\d*)?|\.\d+)\s*(%?)\s*"
+_LIMIT = r"\s*([a-z_]+)\s*>\s*(\d+(?:\.\d*)?|\.\d+)\s*(%|mm|cm|m|deg|)\s*"
+# Of residuals of poses: in mm, or degrees.
+_POSE = "pose"
+_UNITS = {"mm": 1.0, "cm": 10.0, "m": 1000.0, "deg": 1.0}
 _EXAMPLE = "write loss>0.1%,underfilled>0"
 
 
 class Limit(NamedTuple):
-    """A limit of one quantity: a number, or a share in percent."""
+    """A limit of one quantity: a number, a share in percent, or a shift or turn with its unit."""
 
     text: str
     quantity: str
     most: float
-    is_percent: bool
+    unit: str
 
     def exceeded(self, report: RunReport) -> str:
         """Text that says how the limit is exceeded; "" if it is not."""
+        if self.quantity == _POSE:
+            return self._exceeded_by_pose(report)
         quantity = _QUANTITIES[self.quantity]
         for owner, (part, whole) in quantity.amounts(report):
             share = 100 * part / whole if whole else 0.0
-            if (share if self.is_percent else part) > self.most:
+            if (share if self.unit else part) > self.most:
                 found = f"{part} of {whole} ({share:.4g} %)" if quantity.is_share else str(part)
                 sensor = f"{owner}: " if owner else ""
                 return f"{self.text}: found {sensor}{found} {quantity.unit}"
+        return ""
+
+    def _exceeded_by_pose(self, report: RunReport) -> str:
+        """By two standard deviations, or by surfaces that do not fit at all."""
+        for pair in () if report.poses is None else report.poses.pairs:
+            found, sigma = pair.shift_mm, pair.shift_deviation_mm
+            if self.unit == "deg":
+                found, sigma = pair.turn_deg, pair.turn_deviation_deg
+            is_beyond = found is not None and (
+                found - 2 * (sigma or 0.0) > self.most * _UNITS[self.unit]
+            )
+            if is_beyond or pair.outcome == MISFIT:
+                return f"{self.text}: found {pair.describe()}"
         return ""
 
 
@@ -53,18 +72,24 @@ def _parsed(text: str) -> Limit:
         raise UsageError(
             f"--fail-on: expected NAME>NUMBER or NAME>NUMBER%, found {text!r}; {_EXAMPLE}"
         )
-    name, number, percent = found.groups()
+    name, number, unit = found.groups()
+    if name == _POSE:
+        if unit not in _UNITS:
+            raise UsageError(
+                f"--fail-on: expected {_POSE}>NUMBER with mm, cm, m or deg, found "
+                f"{text.strip()!r}; write {_POSE}>5cm"
+            )
+        return Limit(text.strip(), name, float(number), unit)
     quantity = _QUANTITIES.get(name)
     if quantity is None:
-        raise UsageError(
-            f"--fail-on: expected one of {', '.join(_QUANTITIES)}, found {name!r}; {_EXAMPLE}"
-        )
-    if percent and not quantity.is_share:
+        known = ", ".join((*_QUANTITIES, _POSE))
+        raise UsageError(f"--fail-on: expected one of {known}, found {name!r}; {_EXAMPLE}")
+    if unit and (unit != "%" or not quantity.is_share):
         raise UsageError(
             f"--fail-on: expected a number of {quantity.unit}, found {text.strip()!r}; "
             f"write {name}>{number}"
         )
-    return Limit(text.strip(), name, float(number), bool(percent))
+    return Limit(text.strip(), name, float(number), unit)
 
 
 # -- quantities -----------------------------------------------------------------------------------

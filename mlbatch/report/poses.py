@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 # Outcomes of a pair: its surfaces were compared; they are proven to be apart; they do not fit at
@@ -56,15 +57,17 @@ class PairFigures(NamedTuple):
         if self.outcome == NOT_CHECKED:
             return f"{names}: not checked, since {self.reason}"
         seen = f"{names} have {self.overlap_percent:.0f} % of their surfaces in common"
+        if self.swapped and self.outcome == MISFIT:
+            return f"{seen}{self._swapped()}"
         if self.outcome == MISFIT:
             return (
                 f"{seen}; of {self.surfaces} only {self.fit_percent:.0f} % fit: the poses are "
-                "wrong by more than this can measure" + self._swapped()
+                "wrong by more than this can measure"
             )
         if self.outcome == OFF:
             found = f"double walls: {self.lidars[-1]} is {self._found()} off"
         else:
-            found = f"they agree within {self._bounds()}"
+            found = f"they agree within {_bounds([self])}"
         text = f"{seen}; {found}"
         if self.undetermined:
             text += f" (not determined by the scene: {', '.join(self.undetermined)})"
@@ -73,7 +76,7 @@ class PairFigures(NamedTuple):
     def _swapped(self) -> str:
         if not self.swapped:
             return ""
-        return f"; with the poses of {' and '.join(self.lidars)} exchanged they fit: names swapped?"
+        return "; with the two poses exchanged they fit: names swapped?"
 
     def _found(self) -> str:
         parts = []
@@ -83,14 +86,22 @@ class PairFigures(NamedTuple):
             parts.append(f"{self.turn_deg:.2f} degrees")
         return " / ".join(parts)
 
-    def _bounds(self) -> str:
-        """Two standard deviations above what was found."""
-        parts = []
-        if self.shift_mm is not None:
-            parts.append(f"{self.shift_mm + 2 * (self.shift_deviation_mm or 0.0):.0f} mm")
-        if self.turn_deg is not None:
-            parts.append(f"{self.turn_deg + 2 * (self.turn_deviation_deg or 0.0):.2f} degrees")
-        return ", ".join(parts)
+
+def _bounds(pairs: Sequence[PairFigures]) -> str:
+    """Two standard deviations above the largest figures of pairs."""
+    shifts_mm = [
+        pair.shift_mm + 2 * (pair.shift_deviation_mm or 0.0)
+        for pair in pairs
+        if pair.shift_mm is not None
+    ]
+    turns_deg = [
+        pair.turn_deg + 2 * (pair.turn_deviation_deg or 0.0)
+        for pair in pairs
+        if pair.turn_deg is not None
+    ]
+    parts = [f"{max(shifts_mm):.0f} mm"] if shifts_mm else []
+    parts += [f"{max(turns_deg):.2f} degrees"] if turns_deg else []
+    return ", ".join(parts)
 
 
 class PoseFigures(NamedTuple):
@@ -99,9 +110,19 @@ class PoseFigures(NamedTuple):
     reason: str = ""
     pairs: tuple[PairFigures, ...] = ()
 
-    @property
-    def not_known(self) -> str:
-        """Why no pair was compared, or ""."""
-        if self.reason or any(pair.is_known for pair in self.pairs):
-            return self.reason
-        return "; ".join(dict.fromkeys(pair.reason for pair in self.pairs)) or ONE_LIDAR
+    def describe(self) -> str:
+        """What a verdict says of the poses."""
+        if self.reason:
+            return f"poses: not checked ({self.reason})"
+        known = [pair for pair in self.pairs if pair.is_known]
+        if not known:
+            reasons = dict.fromkeys(pair.reason for pair in self.pairs)
+            return f"poses: not checked, since {'; '.join(reasons)}"
+        if any(pair.is_wrong for pair in known):
+            return "poses are wrong"
+        text = f"surfaces agree within {_bounds(known)}"
+        if any(pair.undetermined for pair in known):
+            text += " in the directions that the scene determines"
+        if len(known) < len(self.pairs):
+            text += f", of {len(known)} of {len(self.pairs)} pairs of lidars"
+        return text

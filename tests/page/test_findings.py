@@ -25,10 +25,15 @@ def found(document: dict[str, Any], columns: list[list[int]] | None = None) -> l
     ]
 
 
+def _verdict(document: dict[str, Any]) -> tuple[Level, str, str]:
+    read = RunReport.from_json(document)
+    return verdict(findings(read, None), read)
+
+
 def test_a_clean_run_has_no_finding() -> None:
     document = report(sensor("left"), sensor("right", 1))
     assert found(document, [[512, 512]] * 10) == []
-    assert verdict(findings(RunReport.from_json(document), None)) == (
+    assert _verdict(document) == (
         Level.GOOD,
         "Packets, windows and clocks are fine; poses not checked",
         "",
@@ -110,7 +115,7 @@ def test_drifting_clocks_are_weighed_by_the_length_of_the_recording() -> None:
 def test_the_verdict_is_the_worst_finding() -> None:
     warning = {"code": "calibration", "sensor": "left", "message": "a note"}
     document = report(sensor("left", bad_size=50), sensor("right", 1, lost=2), warnings=[warning])
-    level, heading, others = verdict(findings(RunReport.from_json(document), None))
+    level, heading, others = _verdict(document)
     assert level == Level.PROBLEM
     assert heading == "50 packets of left rejected (bad size 50)."
     assert others == "1 problem and 1 warning below."

@@ -231,7 +231,7 @@ def test_convert_writes_the_page_with_its_command(shell: Shell) -> None:
     outcome = shell(f"convert {FIX} -o scans.mcap --html page.html --quiet")
     assert (outcome.code, outcome.err) == (0, "")
     page = Path("page.html").read_text(encoding="utf-8")
-    assert "Packets, windows and clocks are fine; poses not checked" in page
+    assert "Packets, windows and clocks are fine; surfaces agree within " in page
     assert "mlbatch convert" in page
     assert "--html page.html" in page
     assert Path("page.html").stat().st_size < 1_000_000

@@ -26,9 +26,20 @@ REPORT = RunReport.from_json(
             **{"written": 40, "underfilled": 2, "incomplete": 0, "empty": 3, "empty_clouds": 0},
             **{"dropped_incomplete": 4, "no_points": {"b": 5}},
         },
+        "poses": {
+            "pairs": [
+                {"lidars": ["a", "c"], "outcome": "not checked", "reason": "seen nothing"},
+                {
+                    **{"lidars": ["a", "b"], "outcome": "off", "overlap_percent": 41.2},
+                    **{"shift_mm": 31.0, "shift_deviation_mm": 2.0},
+                    **{"turn_deg": 0.4, "turn_deviation_deg": 0.01},
+                },
+            ]
+        },
         "warnings": [{"code": "clouds"}, {"code": "loss"}, {"code": "cut_off"}],
     }
 )
+APART = "a and b have 41 % of their surfaces in common; double walls: b is 31 mm / 0.40 degrees off"
 EXCEEDED = [
     # 10 of 1000 of b, 1 of 1000 of a.
     ("loss>0.99%", "loss>0.99%: found b: 10 of 1000 (1 %) packets lost"),
@@ -50,6 +61,13 @@ EXCEEDED = [
     ("warnings>2", ""),
     ("cut_off>0", "cut_off>0: found 1 recordings cut off"),
     ("cut_off>1", ""),
+    # By two standard deviations: 27 mm, 0.38 degrees.
+    ("pose>2.6cm", f"pose>2.6cm: found {APART}"),
+    ("pose>26 mm", f"pose>26 mm: found {APART}"),
+    ("pose>28mm", ""),
+    ("pose>0.03m", ""),
+    ("pose>0.37deg", f"pose>0.37deg: found {APART}"),
+    ("pose>0.39deg", ""),
 ]
 
 
@@ -74,6 +92,9 @@ def test_limits_may_be_in_one_list_or_in_several() -> None:
         ("loss>1e3", "expected NAME>NUMBER"),
         ("", "expected NAME>NUMBER or NAME>NUMBER%, found ''"),
         ("loss>1,", "expected NAME>NUMBER or NAME>NUMBER%, found ''"),
+        ("pose>1", "expected pose>NUMBER with mm, cm, m or deg, found 'pose>1'; write pose>5cm"),
+        ("pose>1%", "expected pose>NUMBER with mm, cm, m or deg, found 'pose>1%'"),
+        ("loss>1cm", "expected a number of packets lost, found 'loss>1cm'; write loss>1"),
         ("warnings>1%", "expected a number of warnings, found 'warnings>1%'; write warnings>1"),
     ],
 )
