@@ -25,17 +25,16 @@ from mlbatch.discovery.first_seconds import is_without_packets
 from mlbatch.errors import UsageError
 from mlbatch.frames.tree import some
 from mlbatch.native import require_library
+from mlbatch.pipeline.extract_files import side_files
 from mlbatch.pipeline.extract_places import Assigned, ChosenLidar, Place, Places
 from mlbatch.pipeline.passthrough import MessageQueue
 from mlbatch.pipeline.time_limits import refuse_outside, text_of_range
 from mlbatch.readers import has_packets, open_recordings
 from mlbatch.readers.byte_records import SLACK
-from mlbatch.rig.rig import DEFAULT_BODY_FRAME, Rig, RigSensor, UnknownExtrinsics
-from mlbatch.rig.write import write_rig
 from mlbatch.ros.packet_writing import Stamped
 from mlbatch.types import Message, PacketBatch, Recording, StreamTable, Topic
 from mlbatch.units import NS_PER_S
-from mlbatch.writers.atomic import Output, discard, export_errors, prepare
+from mlbatch.writers.atomic import Output, check_name, discard, export_errors, prepare
 from mlbatch.writers.recordings import (
     ENCODINGS,
     MOST_HOST_NS,
@@ -53,8 +52,6 @@ REASONS = ("not_chosen", "outside_time", "no_place")
 # Reading ends so much after the end: the receive times of bags and of several queues step back.
 _AFTER_END_NS = 10 * NS_PER_S
 _KIND_BITS = 17
-# Options of a rig that this command has applied.
-_APPLIED = ("only", "ignore", "pass")
 
 
 @dataclass(frozen=True, slots=True)
@@ -149,7 +146,8 @@ def extract(request: Extraction, progress: Callable[[int, int], object] | None =
     topics = _forwarded(setup.recordings, request, encodings)
     places = Places(setup, encodings)
     _refuse_without_place(places, target)
-    texts = _side_files(setup, places, request, topics)
+    selects = bool(selection.only or selection.ignore)
+    texts = side_files(places, target, topics, selects=selects)
     outputs: list[Output] = []
     try:
         paths = [target, *texts]
@@ -181,6 +179,7 @@ def _check_target(request: Extraction) -> None:
             f"--pass: expected a bag, which stores messages, found {target.name}; leave it out, or "
             "write a .mcap"
         )
+    check_name(target)
     for path in request.recordings:
         if path.exists() and target.exists() and os.path.samefile(path, target):
             raise UsageError(
@@ -234,94 +233,6 @@ def _forwarded(
                 f"{request.output.name}, found {topic.encoding!r}; do not pass it"
             )
     return frozenset(found)
-
-
-# -- files next to the recording --------------------------------------------------------------
-
-
-def _side_files(
-    setup: Discovery, places: Places, request: Extraction, topics: frozenset[Topic]
-) -> dict[Path, bytes]:
-    """Calibrations and the rig by their paths; a calibration in the folder is not copied."""
-    target = request.output
-    carried = {topic.name for topic in topics}
-    recorded = setup.first.metadata.calibration_texts
-    files: dict[Path, bytes] = {}
-    # By where it comes from: lidars may share one.
-    known: dict[str, Path] = {}
-    metadata: dict[str, Path] = {}
-    for sensor in setup.sensors:
-        origin = sensor.lidar.calibration
-        is_file = bool(origin) and Path(origin).is_file()
-        if origin in carried or not (origin in recorded or is_file):
-            continue
-        if origin not in known:
-            content = recorded[origin] if origin in recorded else Path(origin).read_bytes()
-            suffix = _suffix(content) if origin in recorded else Path(origin).suffix
-            known[origin] = target.with_name(f"{target.stem}.{sensor.name}{suffix}")
-            if is_file and os.path.samefile(Path(origin).parent, target.parent):
-                known[origin] = Path(origin)
-            else:
-                files[known[origin]] = content
-        metadata[sensor.name] = known[origin]
-    is_capture = not ENCODINGS[target.suffix]
-    lacks_frames = any(
-        is_metadata(topic) and not has_packets(topic) and topic not in topics
-        for recording in setup.recordings
-        for topic in recording.topics
-    )
-    streams = setup.sampler.table.streams
-    moves = any(bool(streams[one.stream].topic) == is_capture for one in setup.sampler.kinds)
-    if setup.sensors and (setup.rig is not None or lacks_frames or moves):
-        rig = _rig(setup, places, request, metadata, lacks_frames=lacks_frames)
-        path = target.with_name(f"{target.stem}.rig.yaml")
-        files[path] = write_rig(rig, target.parent).encode()
-    # An earlier extract may share them.
-    return {
-        path: content
-        for path, content in files.items()
-        if not (path.is_file() and path.read_bytes() == content)
-    }
-
-
-def _suffix(content: bytes) -> str:
-    """Suffix of a recorded calibration, by its content: JSON, angles as text or as bytes."""
-    if content.lstrip().startswith(b"{"):
-        return ".json"
-    return ".csv" if content.isascii() else ".dat"
-
-
-def _rig(
-    setup: Discovery,
-    places: Places,
-    request: Extraction,
-    metadata: dict[str, Path],
-    *,
-    lacks_frames: bool,
-) -> Rig:
-    """The rig of the chosen lidars; lacks_frames: the new recording has no transforms."""
-    streams = setup.sampler.table.streams
-    found = []
-    for number, sensor in enumerate(setup.sensors):
-        known = UnknownExtrinsics() if not sensor.pose.is_known else sensor.pose.body_from_sensor
-        rig = sensor.rig or RigSensor(sensor.name, extrinsics=known)
-        extrinsics = known if isinstance(rig.extrinsics, str) and lacks_frames else rig.extrinsics
-        place = places.main_place(number)
-        stream = rig.stream
-        if place is not None and (sensor.rig is None or place.to != streams[place.stream]):
-            stream = places.selector(number)
-        path = metadata.get(sensor.name)
-        found.append(replace(rig, stream=stream, metadata=path, extrinsics=extrinsics))
-    if setup.rig is not None:
-        selects = bool(request.selection.only or request.selection.ignore)
-        kept = tuple(
-            option
-            for option in setup.rig.options
-            if option.name not in _APPLIED or (option.name != "pass" and not selects)
-        )
-        return replace(setup.rig, sensors=tuple(found), options=kept)
-    names = {sensor.name for sensor in found}
-    return Rig(tuple(found), DEFAULT_BODY_FRAME if setup.frame_id in names else setup.frame_id)
 
 
 # -- packets ----------------------------------------------------------------------------------

@@ -374,7 +374,7 @@ def test_ouster_sdk(tmp_path: Path) -> None:
     source = TWO_LIDARS / "two_lidars.pcap"
     capture = extracted(tmp_path, source, TWO_LIDARS / "rig.yaml", "left")
     metadata = json.loads((TWO_LIDARS / "left.json").read_text(encoding="utf-8"))
-    # The SDK expects it, and may be told nothing by it.
+    # The SDK requires this key, with any content.
     path = tmp_path / "sdk.json"
     path.write_text(json.dumps(metadata | {"calibration_status": {}}), encoding="utf-8")
     found = read_by("ouster-sdk", capture, path)

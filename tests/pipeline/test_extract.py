@@ -170,7 +170,7 @@ def test_one_of_two_lidars_on_a_port(suffix: str, tmp_path: Path) -> None:
     assert prints(in_memory(other)) == prints(in_memory(left))
 
 
-def test_lidars_that_share_a_topic_are_told_apart(tmp_path: Path) -> None:
+def test_lidars_that_share_a_topic_are_separated(tmp_path: Path) -> None:
     """By their serial numbers, and so they get addresses of their own."""
     one_topic = [
         replace(recorded, topic=re.sub("left|right", "both", recorded.topic))
@@ -276,6 +276,7 @@ def test_times_of_messages_are_no_times_of_packets(tmp_path: Path) -> None:
 
 MISTAKES: Mapping[str, tuple[dict[str, object], str]] = {
     "suffix": ({"output": "out.txt"}, "expected a name that ends with .pcap"),
+    "folder": ({"output": "none/out.pcap"}, "expected an output in an existing folder"),
     "itself": ({"output": "two_lidars.pcap"}, "expected another file than the recordings"),
     "pass": ({"passed": ("/imu",)}, "--pass: expected a bag"),
     "no topic": ({"output": "out.mcap", "passed": ("/imu",)}, "expected a topic of the recording"),
