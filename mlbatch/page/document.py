@@ -326,7 +326,9 @@ def _clock(sensor: SensorReport, recorded_s: float) -> tuple[str, ...]:
     if ppm is not None:
         drift = f"{ppm:+.2f} ppm"
         if recorded_s:
-            drift += f", {ppm * recorded_s / 1000:+.2f} ms in {_seconds(recorded_s)}"
+            drift += (
+                f", {round(ppm * recorded_s / 1000, 2) + 0.0:+.2f} ms in {_seconds(recorded_s)}"
+            )
     return (
         sensor.name,
         clock.source,
