@@ -26,8 +26,8 @@ from mlbatch.units import NS_PER_S
 _MAP_WINDOWS = 20
 # Windows before and after one that its motion is interpolated from.
 _REACH = 2
-# More points a window do not make the motion better.
-_MOST_POINTS = 30_000
+# More points a window are thinned; thin trunks need all of 128 beams.
+_MOST_POINTS = 130_000
 # Cells, m, and least cosine between normals, of the direction that stands for upward.
 _UP_EDGE_M = 1.0
 _UP_PARALLEL = 0.97
@@ -202,16 +202,22 @@ class Odometry:
         return None if velocity is None else velocity * gap_s
 
     def _curve(self) -> tuple[F64Array, F64Array] | None:
-        """Times (2 _REACH + 1,) of the windows from that in the middle, and twists to each."""
-        middles = [window.middle_ns for window in self._around]
-        gaps_s = np.diff(middles) / NS_PER_S
-        poses = [ORIGIN]
-        for window, gap_s in zip(list(self._around)[1:], gaps_s, strict=True):
-            if window.velocity is None:
-                return None
-            poses.append(poses[-1].then(window.velocity * gap_s))
-        times_s = (np.array(middles) - middles[_REACH]) / NS_PER_S
-        return times_s, np.array([poses[_REACH].twist_to(pose) for pose in poses])
+        """Times (n,) of windows from that in the middle, and twists (n, 6) to each.
+
+        Of fewer windows where the motion of one is not known.
+        """
+        for reach in range(_REACH, 0, -1):
+            around = list(self._around)[_REACH - reach : _REACH + reach + 1]
+            middles = [window.middle_ns for window in around]
+            poses = [ORIGIN]
+            for window, gap_ns in zip(around[1:], np.diff(middles), strict=True):
+                if window.velocity is None:
+                    break
+                poses.append(poses[-1].then(window.velocity * (gap_ns / NS_PER_S)))
+            else:
+                times_s = (np.array(middles) - middles[reach]) / NS_PER_S
+                return times_s, np.array([poses[reach].twist_to(pose) for pose in poses])
+        return None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
