@@ -67,8 +67,8 @@ def line(found: MotionPose, true: F64Array) -> str:
     is_false = states == "pose" and (size_mm > MOST_MM or size_deg > MOST_DEG)
     sigma_mm, sigma_deg = 1000.0 * np.linalg.norm(sigma[:3]), np.degrees(np.linalg.norm(sigma[3:]))
     return (
-        f"{states:8}{size_mm:8.1f} mm {size_deg:7.3f} deg   sd {sigma_mm:.1f} mm {sigma_deg:.3f} deg"
-        f"{'  FALSE' if is_false else ''}"
+        f"{states:8}{size_mm:8.1f} mm {size_deg:7.3f} deg"
+        f"   sd {sigma_mm:.1f} mm {sigma_deg:.3f} deg{'  FALSE' if is_false else ''}"
     )
 
 
