@@ -6,6 +6,7 @@ outcome is settled. So it depends on no worker, and a long recording costs no mo
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING
 
@@ -13,6 +14,7 @@ import numpy as np
 
 from mlbatch.arrays import F64Array, I64Array
 from mlbatch.decode.decoder import Decoder, ScanHeader
+from mlbatch.frames.transforms import from_rpy_deg
 from mlbatch.pipeline.sensor import Sensor
 from mlbatch.report.poses import PoseFigures
 from mlbatch.units import NS_PER_S
@@ -103,7 +105,7 @@ class PoseCheck:
         if self._comparison is None:
             names = [sensor.name for sensor in self._sensors]
             poses = [sensor.body_from_sensor for sensor in self._sensors]
-            self._comparison = PoseComparison(names, poses)
+            self._comparison = PoseComparison(names, poses, _as_radians(self._sensors))
         clouds = []
         for parts in self._place.values():
             points_m, stamp_ns, lidar = (
@@ -116,3 +118,17 @@ class PoseCheck:
                 clouds.append(Cloud(number, points_m[rows], time_s[rows], origin_m))
         self._comparison.add(clouds)
         self._is_over = self._comparison.is_settled
+
+
+def _as_radians(sensors: Sequence[Sensor]) -> list[F64Array] | None:
+    """Poses if the angles of the rig were meant as radians; None where they cannot have been."""
+    poses = []
+    largest = 0.0
+    for sensor in sensors:
+        angles = () if sensor.rig is None else sensor.rig.rotation_rpy_deg
+        if not angles or max(map(abs, angles)) > math.pi + 0.01:
+            return None
+        largest = max(largest, *map(abs, angles))
+        pose = sensor.body_from_sensor
+        poses.append(from_rpy_deg(tuple(pose[:3, 3]), tuple(map(math.degrees, angles))))
+    return poses if largest else None

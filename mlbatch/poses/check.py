@@ -28,7 +28,15 @@ from mlbatch.poses.solve import (
     solve,
 )
 from mlbatch.poses.surfaces import Planes, shared_cells
-from mlbatch.report.poses import MEASURED, MISFIT, NOT_CHECKED, OFF, PairFigures
+from mlbatch.report.poses import (
+    EXCHANGED,
+    MEASURED,
+    MISFIT,
+    NOT_CHECKED,
+    OFF,
+    RADIANS,
+    PairFigures,
+)
 
 # A wrong pose: a residual above these is a warning.
 LIMIT_M = 0.03
@@ -125,14 +133,19 @@ class PoseComparison:
         self,
         names: Sequence[str],
         body_from_sensor: Sequence[F64Array],
+        as_radians: Sequence[F64Array] | None = None,
         *,
-        tries_swapped: bool = True,
+        tries_others: bool = True,
     ) -> None:
-        """body_from_sensor: (4, 4) of each lidar, m, as the points are converted."""
+        """body_from_sensor: (4, 4) of each lidar, m, as the points are converted.
+
+        as_radians: poses if angles were meant as radians, where they may have been.
+        """
         self.places = 0
         self._names = names
         self._poses = body_from_sensor
-        self._tries_swapped = tries_swapped
+        self._as_radians = as_radians
+        self._tries_others = tries_others
         self._pairs = {pair: _Pair() for pair in combinations(range(len(names)), 2)}
         self._estimates: list[_Estimate] = []
         # Of places where something seems to be off.
@@ -205,17 +218,22 @@ class PoseComparison:
     def figures(self) -> tuple[PairFigures, ...]:
         """What is known of each pair."""
         found = self._measured()
-        if not self._tries_swapped:
+        if not self._tries_others:
             return found
-        return tuple(map(self._with_swapped, self._pairs, found))
+        return tuple(map(self._with_cause, self._pairs, found))
 
-    def _with_swapped(self, key: tuple[int, int], pair: PairFigures) -> PairFigures:
-        is_clear = pair.outcome == MEASURED and not pair.undetermined
-        if is_clear or not self._fits_swapped(key, is_whole=not pair.is_wrong):
+    def _with_cause(self, key: tuple[int, int], pair: PairFigures) -> PairFigures:
+        """Figures with the mistake that explains them, if one does."""
+        if pair.outcome == MEASURED and not pair.undetermined:
             return pair
-        # That they fit with all directions determined is proof, too.
-        outcome = pair.outcome if pair.is_wrong else MISFIT
-        return pair._replace(outcome=outcome, reason="", swapped=True)
+        exchanged = list(self._poses)
+        exchanged[key[0]], exchanged[key[1]] = self._poses[key[1]], self._poses[key[0]]
+        for cause, poses in ((EXCHANGED, exchanged), (RADIANS, self._as_radians)):
+            if poses is not None and self._fits(key, poses, is_whole=not pair.is_wrong):
+                # That they fit in all directions is proof, too.
+                outcome = pair.outcome if pair.is_wrong else MISFIT
+                return pair._replace(outcome=outcome, reason="", fits_with=cause)
+        return pair
 
     def _measured(self) -> tuple[PairFigures, ...]:
         joined = _joined(self._estimates)
@@ -314,20 +332,19 @@ class PoseComparison:
                 found[:, 6 * (lidar - 1) : 6 * lidar] += sign * six
         return found
 
-    def _fits_swapped(self, key: tuple[int, int], *, is_whole: bool) -> bool:
-        """Whether surfaces fit with the poses of two lidars exchanged.
+    def _fits(self, key: tuple[int, int], poses: Sequence[F64Array], *, is_whole: bool) -> bool:
+        """Whether surfaces of two lidars fit with other poses.
 
         is_whole: all directions have to be determined.
         """
-        one, other = (self._poses[lidar] for lidar in key)
-        moves = {key[0]: other @ np.linalg.inv(one), key[1]: one @ np.linalg.inv(other)}
-        poses = list(self._poses)
-        poses[key[0]], poses[key[1]] = other, one
-        comparison = PoseComparison(self._names, poses, tries_swapped=False)
-        for place in self._kept:
-            comparison.add([_moved(cloud, moves.get(cloud.lidar)) for cloud in place])
-        if comparison.places < _LEAST_PLACES:
+        if len(self._kept) < _LEAST_PLACES:
             return False
+        moves = [
+            other @ np.linalg.inv(pose) for pose, other in zip(self._poses, poses, strict=True)
+        ]
+        comparison = PoseComparison(self._names, poses, tries_others=False)
+        for place in self._kept:
+            comparison.add([_moved(cloud, moves[cloud.lidar]) for cloud in place])
         figures = comparison.figures()[list(self._pairs).index(key)]
         return (
             figures.outcome == MEASURED
@@ -350,10 +367,8 @@ class _Part:
     undetermined: tuple[str, ...] = field(default=())
 
 
-def _moved(cloud: Cloud, move: F64Array | None) -> Cloud:
+def _moved(cloud: Cloud, move: F64Array) -> Cloud:
     """A cloud with another pose of its lidar; move: (4, 4)."""
-    if move is None:
-        return cloud
     points_m = np.matmul(cloud.points_m, move[:3, :3].T) + move[:3, 3]
     origin_m = cloud.origin_m
     if origin_m is not None:

@@ -11,6 +11,9 @@ MEASURED = "measured"
 OFF = "off"
 MISFIT = "misfit"
 NOT_CHECKED = "not checked"
+# Mistakes that explain a wrong pose.
+EXCHANGED = "exchanged"
+RADIANS = "radians"
 # Reasons why a run compared nothing.
 ONE_LIDAR = "one lidar"
 NOT_ASKED = "--no-pose-check"
@@ -24,7 +27,7 @@ class PairFigures(NamedTuple):
     the cells with a surface of that lidar which has fewer; fit_percent: share of them with nearly
     parallel and near surfaces; shift_mm: of the second lidar from where it fits the first;
     turn_deg: likewise; both with their standard deviation; undetermined: directions that the scene
-    does not determine; swapped: whether the surfaces fit with the two poses exchanged.
+    does not determine; fits_with: mistake without which the surfaces fit, or "".
     """
 
     lidars: tuple[str, ...]
@@ -39,7 +42,7 @@ class PairFigures(NamedTuple):
     turn_deg: float | None = None
     turn_deviation_deg: float | None = None
     undetermined: tuple[str, ...] = ()
-    swapped: bool = False
+    fits_with: str = ""
 
     @property
     def is_wrong(self) -> bool:
@@ -57,8 +60,8 @@ class PairFigures(NamedTuple):
         if self.outcome == NOT_CHECKED:
             return f"{names}: not checked, since {self.reason}"
         seen = f"{names} have {self.overlap_percent:.0f} % of their surfaces in common"
-        if self.swapped and self.outcome == MISFIT:
-            return f"{seen}{self._swapped()}"
+        if self.fits_with and self.outcome == MISFIT:
+            return f"{seen}{self._cause()}"
         if self.outcome == MISFIT:
             return (
                 f"{seen}; of {self.surfaces} only {self.fit_percent:.0f} % fit: the poses are "
@@ -71,12 +74,14 @@ class PairFigures(NamedTuple):
         text = f"{seen}; {found}"
         if self.undetermined:
             text += f" (not determined by the scene: {', '.join(self.undetermined)})"
-        return text + self._swapped()
+        return text + self._cause()
 
-    def _swapped(self) -> str:
-        if not self.swapped:
-            return ""
-        return "; with the two poses exchanged they fit: names swapped?"
+    def _cause(self) -> str:
+        if self.fits_with == EXCHANGED:
+            return "; with the two poses exchanged they fit: names swapped?"
+        if self.fits_with == RADIANS:
+            return "; with rotation_rpy_deg as radians they fit: write degrees"
+        return ""
 
     def _found(self) -> str:
         parts = []
