@@ -19,6 +19,8 @@ from mlbatch.poses.hand_eye import Noise, known_rows, transformed
 from mlbatch.units import NS_PER_MS, NS_PER_S
 
 _LEAST_STEPS = 30
+# Parts of a window that the turns of a lidar are interpolated at.
+_FINER = 10
 # Delays that are tried first.
 _FARTHEST_NS = NS_PER_S
 _STEP_NS = 20 * NS_PER_MS
@@ -93,6 +95,43 @@ def turning(seen: F64Array, middle_ns: I64Array, turns: Turns, name: str) -> Tur
             state = fit.after(state)
     covariance = np.asarray(np.linalg.inv(fit.normal(state)), np.float64) + np.diag(_ADDED)
     return Turning(*state, covariance, *_words(fit, state, covariance, name))
+
+
+def gyroscope_turns(stamp_ns: I64Array, rate: F64Array) -> Turns:
+    """Turns by the samples (n, 3) of a gyroscope, rad/s, at increasing times (n,)."""
+    step_s = np.diff(stamp_ns) / NS_PER_S
+    steps = 0.5 * (rate[1:] + rate[:-1]) * step_s[:, None]
+    return Turns(stamp_ns, np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)]))
+
+
+def lidar_turns(turned: F64Array, middle_ns: I64Array) -> Turns:
+    """Turns by rotation vectors (k, 3) of a lidar between the middles (k,) of windows, rad.
+
+    Between middles by cubics (E. Catmull, R. Rom, 1974); where a rotation is not known, as between
+    those around it.
+    """
+    rows = np.arange(len(turned))
+    known = known_rows(turned)
+    if known.sum() < _LEAST_STEPS:
+        return Turns(middle_ns[:0], np.zeros((0, 3)))
+    filled = np.stack([np.interp(rows, rows[known], part[known]) for part in turned.T], axis=1)
+    total = np.cumsum(filled, axis=0)
+    before, begin, end, after = total[:-3], total[1:-2], total[2:-1], total[3:]
+    shares = np.arange(_FINER)[:, None, None] / _FINER
+    slope, next_slope = (end - before) / 2.0, (after - begin) / 2.0
+    curve = begin + shares * (
+        slope
+        + shares
+        * (
+            3.0 * (end - begin)
+            - 2.0 * slope
+            - next_slope
+            + shares * (2.0 * (begin - end) + slope + next_slope)
+        )
+    )
+    gap_ns = (middle_ns[2:-1] - middle_ns[1:-2]) // _FINER
+    stamps = middle_ns[1:-2] + np.arange(_FINER)[:, None] * gap_ns
+    return Turns(stamps.T.reshape(-1), curve.transpose(1, 0, 2).reshape(-1, 3))
 
 
 # Rotation first_from_other, bias, delay.

@@ -10,7 +10,7 @@ import pytest
 from mlbatch.arrays import F64Array, I64Array
 from mlbatch.motion.agreement import Turns
 from mlbatch.motion.se3 import exp_rotation, log_rotation
-from mlbatch.poses.turning import turning
+from mlbatch.poses.turning import gyroscope_turns, lidar_turns, turning
 
 MIDDLE_NS = np.arange(200, dtype=np.int64) * 100_000_000 + 2_000_000_000
 BIAS = np.array([0.01, -0.004, 0.006])
@@ -72,6 +72,29 @@ def test_samples_of_another_time_are_refused() -> None:
     seen, turns = seen_and_felt(2, np.eye(3), 0)
     found = turning(seen, MIDDLE_NS, Turns(turns.stamp_ns + 10**12, turns.total), "imu")
     assert "found 0" in found.undetermined
+
+
+@pytest.mark.parametrize("late_s", [0.0, 0.037, -0.25])
+def test_the_clock_of_another_lidar(late_s: float) -> None:
+    rotation = exp_rotation(np.array([[0.3, -0.2, 1.0]]))[0]
+    seen, _ = seen_and_felt(2, np.eye(3), 0)
+    # What happens at a time has a stamp that is late.
+    total = turned(MIDDLE_NS * 1e-9 - late_s, 2) @ rotation
+    draw = np.random.default_rng(5).normal(size=total.shape) * 3e-4
+    other = np.diff(total + draw, axis=0, prepend=np.nan)
+    other[60:63] = np.nan
+    found = turning(seen, MIDDLE_NS, lidar_turns(other, MIDDLE_NS), "rear")
+    assert not found.late_undetermined
+    assert found.delay_s == pytest.approx(late_s, abs=3e-3)
+
+
+def test_even_turns_do_not_tell_a_delay() -> None:
+    total = np.array([0.0, 0.0, 0.3]) * (MIDDLE_NS * 1e-9)[:, None]
+    draw = np.random.default_rng(5).normal(size=total.shape) * 3e-4
+    seen = np.diff(total + draw, axis=0, prepend=np.nan)
+    stamp_ns: I64Array = np.arange(2400, dtype=np.int64) * 10_000_000
+    felt = gyroscope_turns(stamp_ns, np.tile([0.0, 0.0, 0.3], (2400, 1)))
+    assert turning(seen, MIDDLE_NS, felt, "imu").late_undetermined
 
 
 def split(pair: tuple[F64Array, Turns]) -> tuple[F64Array, I64Array, Turns]:
