@@ -53,7 +53,7 @@ def side_files(
     )
     streams = setup.sampler.table.streams
     moves = any(bool(streams[one.stream].topic) == is_capture for one in setup.sampler.kinds)
-    # Also where files are copied: beside those of other extracts they may be ambiguous.
+    # Also where files are copied: with those of other extracts they may be ambiguous.
     if setup.sensors and (setup.rig is not None or lacks_frames or moves or files):
         rig = _rig(places, metadata, lacks_frames=lacks_frames, selects=selects)
         path = target.with_name(f"{target.stem}.rig.yaml")
