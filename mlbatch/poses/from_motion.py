@@ -20,6 +20,7 @@ from mlbatch.motion.registration import ORIGIN, Cloud, Pose
 from mlbatch.motion.se3 import exp_rotation, exp_transform, rotated
 from mlbatch.poses.hand_eye import Steps, hand_eye, known_rows
 from mlbatch.poses.surfaces import planes
+from mlbatch.poses.turning import lidar_turns, turning
 from mlbatch.units import NS_PER_S
 
 # A map of 2 s drifts by some mm over 8 s.
@@ -42,6 +43,8 @@ _MOST_SIGMA_M = 0.007
 _MOST_SIGMA_RAD = math.radians(0.035)
 # And of a start that surfaces in common can refine, of which a guess may be 1 m and 20 degrees off.
 _MOST_START_RAD = math.radians(6.0)
+# Between two clocks.
+_MOST_LATE_S = 0.015
 _ALONG = math.cos(math.radians(25.0))
 
 _INSTEAD = (
@@ -295,6 +298,7 @@ def _pose(
         f"{1000.0 * sigma:.2g} mm only; {_INSTEAD}"
         for way, sigma in shifts
     ]
+    words += _late(first, other, middle_ns, names)
     worst = max((sigma for _, sigma in turns), default=0.0)
     refusal = ""
     if worst > _MOST_START_RAD:
@@ -310,6 +314,21 @@ def _pose(
         tuple(words),
         refusal,
     )
+
+
+def _late(
+    first: F64Array, other: F64Array, middle_ns: I64Array, names: tuple[str, str]
+) -> list[str]:
+    """That the clocks of two lidars differ, which the law of their motions presumes they do not."""
+    found = turning(first[:, 3:], middle_ns, lidar_turns(other[:, 3:], middle_ns), names[1])
+    late_s = found.delay_s
+    if found.late_undetermined or abs(late_s) < max(_MOST_LATE_S, 5.0 * found.delay_sigma_s):
+        return []
+    return [
+        f"{names[1]}: expected stamps of the clock of {names[0]}, found turns "
+        f"{1000.0 * abs(late_s):.0f} ms {'after' if late_s > 0 else 'before'} those of {names[0]}; "
+        "correct its offset_ns in the rig, or synchronise the clocks"
+    ]
 
 
 def _refused(reason: str) -> MotionPose:

@@ -23,9 +23,9 @@ def middles() -> I64Array:
     return np.arange(STEPS, dtype=np.int64) * NS
 
 
-def body_twists(motion: str) -> F64Array:
+def body_twists(motion: str, late_s: float = 0.0) -> F64Array:
     """Twists (STEPS, 6) of a body per 0.1 s: x ahead, z up."""
-    s = 0.1 * np.arange(STEPS)
+    s = 0.1 * np.arange(STEPS) - late_s
     twists = np.zeros((STEPS, 6))
     if motion != "standstill":
         twists[:, 0] = 0.4 + 0.1 * np.sin(0.5 * s)
@@ -115,6 +115,20 @@ def test_a_straight_line_leaves_the_turn_about_it(seed: int) -> None:
     assert "figure of eight" in found.refusal
     turns = found.weak[3:][:, np.abs(found.weak[3:]).max(axis=0) > 0]
     assert np.abs(turns.T @ ahead).max() > 0.999
+
+
+@pytest.mark.parametrize("late_s", [0.06, -0.06])
+def test_clocks_that_differ_are_named(late_s: float) -> None:
+    first, other = mountings(3)
+    twists = np.stack(
+        [
+            noisy(seen_by(body_twists("full"), first), 1),
+            noisy(seen_by(body_twists("full", late_s), other), 2),
+        ]
+    )
+    (_, found) = poses_of_twists(twists, middles(), ("front", "rear")).poses
+    (words,) = [words for words in found.undetermined if "clock of front" in words]
+    assert "60 ms after" in words if late_s > 0 else "60 ms before" in words
 
 
 def test_a_machine_that_stands_is_refused() -> None:
