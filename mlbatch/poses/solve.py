@@ -41,10 +41,13 @@ _UNKNOWN_M = 1.0
 _SPEED_MPS, _TURN_RADPS = 15.0, 1.5
 # Damping: standard deviations of a step where nothing is seen, m and m/s; largest steps.
 _STEP_M, _STEP_MPS = 0.2, 1.0
+# Steps of noise alone are divided by one more than this.
+_CALM = 3.0
 _LONGEST_M, _LONGEST_RAD = 0.5, 0.1
 _LONGEST_MPS, _LONGEST_RADPS = 5.0, 0.5
-# A step that changes poses by less ends the search.
+# A step that changes poses and twists by less ends the search.
 _SMALL_M, _SMALL_RAD = 1e-4, 1e-5
+_SMALL_MPS, _SMALL_RADPS = 5e-3, 5e-4
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -98,8 +101,13 @@ class Level:
 
 FINE = Level(0.5, 0.97, 0.15)
 LEVELS = (Level(2.0, 0.9, 1.0, 20_000), Level(1.0, 0.94, 0.4, 40_000), FINE)
-# Few beams have planes in large cells only, ground among plants in small ones only.
-_ALL_CELLS = Level(0.25, 0.97, 0.15, 60_000, 3)
+# Of a search from afar. Few beams give planes in large cells only, ground among plants in small
+# ones only.
+_SEARCH = (
+    Level(1.0, 0.9, 1.0, 20_000, 1),
+    Level(0.5, 0.94, 0.4, 40_000, 1),
+    Level(0.25, 0.97, 0.15, 60_000, 3),
+)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -283,7 +291,7 @@ def solve(problem: Problem, state: State, level: Level, most_steps: int = 25) ->
         step = equations.step()
         state = _after(problem, state, step)
         equations = _Equations(problem, problem.rows(state, level), state)
-        if _is_small(problem, step, max(1.0, level.edge_m / FINE.edge_m) ** 2):
+        if _is_small(problem, step, max(1.0, level.most_m / FINE.most_m) ** 2):
             converged = True
             break
     covariance, weak = equations.determined()
@@ -321,14 +329,18 @@ def find_poses(
     """
     state = guess or State.start(lidars, len(places))
     problem = Problem(places, lidars)
-    for level in LEVELS[:-1]:
+    *coarse, fine = _SEARCH
+    for level in coarse:
         state = solve(problem, state, level).state
-    return solve(Problem(places, lidars, delays=delays), state, _ALL_CELLS)
+    return solve(Problem(places, lidars, delays=delays), state, fine)
 
 
 def _is_small(problem: Problem, step: F64Array, factor: float) -> bool:
     six = np.abs(step[: problem.poses].reshape(-1, problem.each))
+    twists = np.abs(step[problem.poses :].reshape(-1, 6))
     small = (six[:, :3] < factor * _SMALL_M).all() and (six[:, 3:6] < factor * _SMALL_RAD).all()
+    small &= (twists[:, :3] < factor * _SMALL_MPS).all()
+    small &= (twists[:, 3:] < factor * _SMALL_RADPS).all()
     return bool(small)
 
 
@@ -390,8 +402,11 @@ class _Equations:
             self._rows, self._residual, self._off, self._twists, strict=True
         ):
             jacobian = part.jacobian / part.scale
-            weighted = jacobian / (1.0 + off)[:, None]
-            square, slope = np.matmul(weighted.T, jacobian), np.matmul(weighted.T, residual)
+            weight = 1.0 / (1.0 + off)
+            slope = np.matmul(jacobian.T, weight * residual)
+            square = _product(jacobian, weight)
+            # Where normals show nothing but their noise, steps would be a random walk.
+            square += _CALM * _product(part.noise / part.scale, weight)
             slope[size:] += self._prior * twist
             square[size:, size:] += np.diag(self._prior + (lever / _STEP_MPS) ** 2)
             ratio = np.linalg.solve(square[size:, size:], square[size:, :size]).T

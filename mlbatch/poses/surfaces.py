@@ -22,6 +22,8 @@ _LEAST_POINTS = 8
 _LEAST_SPREAD = 0.12
 _MOST_THICK_M = 0.06
 _FLAT = 0.04
+# Where cells begin: the ground of many body frames is at 0, and its noise would part it.
+_OFF_M = 0.11
 # Roughness of surfaces and of the model of a lidar, m.
 _FLOOR_M = 0.004
 
@@ -79,7 +81,7 @@ class Moments:
         rows[:, 3:6] = points_m * x[:, None]
         rows[:, 6], rows[:, 7], rows[:, 8] = y * y, y * z, z * z
         rows[:, 9] = time_s
-        key = voxel_keys(points_m, edge_m)
+        key = voxel_keys(points_m + _OFF_M, edge_m)
         return cls._merged(edge_m, key, np.ones(len(key), np.int64), rows)
 
     def doubled(self) -> Moments:

@@ -86,8 +86,10 @@ class Rig:
         clouds = []
         for window in (-1, 0):
             for lidar, wrong in enumerate(self.wrong):
-                time_s = WINDOW_S * (window + rng.random(count))
                 points_m = faces_points(rng, faces[lidar], count)
+                # The beams turn once in a window, each lidar from another direction.
+                turned = np.arctan2(points_m[:, 1], points_m[:, 0]) / (2 * np.pi) + 0.37 * lidar
+                time_s = WINDOW_S * (window + turned % 1.0)
                 clouds.append(self.cloud(lidar, wrong, points_m, time_s, rng))
         return clouds
 

@@ -225,11 +225,11 @@ def errors(case: Case, solution: Solution) -> F64Array:
     return np.array(found)
 
 
-def run(folder: Path, scene: str, rig: int, count: int, share: float = 1.0) -> None:
+def run(folder: Path, scene: str, rig: int, count: int, share: float, first: int) -> None:
     """Print the errors of a recording, over guesses and choices of places."""
     lidars = rig + 2
     shift, turn, inside, weak, seconds = [], [], [], [], 0.0
-    for seed in range(count):
+    for seed in range(first, first + count):
         rng = np.random.default_rng(seed)
         numbers = [
             int(rng.integers(1, 8)),
@@ -278,10 +278,10 @@ def main(arguments: list[str]) -> None:
             for rig in range(3):
                 make(Path(folder), scene, rig)
     else:
-        count, share, *scenes = rest
+        count, share, first, *scenes = rest
         for name in scenes:
             scene, _, lidars = name.rpartition("-")
-            run(Path(folder), scene, int(lidars) - 2, int(count), float(share))
+            run(Path(folder), scene, int(lidars) - 2, int(count), float(share), int(first))
 
 
 if __name__ == "__main__":
