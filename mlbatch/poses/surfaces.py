@@ -24,6 +24,10 @@ _MOST_THICK_M = 0.06
 _FLAT = 0.04
 # Where cells begin: the ground of many body frames is at 0, and its noise would part it.
 _OFF_M = 0.11
+# Planes along a face of their cell: least cosine; of a slab that touches it, the middle is
+# sqrt(3) standard deviations away.
+_ALIGNED = 0.9
+_CUT = 2.5
 # Roughness of surfaces and of the model of a lidar, m.
 _FLOOR_M = 0.004
 
@@ -115,6 +119,11 @@ class Moments:
         across, along, _ = variance.T
         is_plane = along >= (_LEAST_SPREAD * self.edge_m) ** 2
         is_plane &= across <= np.minimum(_FLAT * along, _MOST_THICK_M**2)
+        # What a face of the cell cuts looks flat, and lies at the same place in every cloud.
+        within_m = (mean + _OFF_M) % self.edge_m
+        margin_m = np.minimum(within_m, self.edge_m - within_m)
+        is_cut = (np.abs(axes[:, :, 0]) > _ALIGNED) & (margin_m < _CUT * np.sqrt(across)[:, None])
+        is_plane &= ~is_cut.any(axis=1)
         variance, axes, count = variance[is_plane], axes[is_plane], count[is_plane]
         noise = np.maximum(variance[:, 0], _FLOOR_M**2) / (count - 3)
         # Of the tilt about each axis along the plane: noise by the spread of the points on it.
