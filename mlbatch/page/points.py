@@ -169,7 +169,8 @@ def _packed(
 ) -> bytes:
     words = (*xyz.T, time, ring)
     planes = [_differences(np.asarray(plane).astype(np.uint16)) for plane in words]
-    coder = zlib.compressobj(9, wbits=-15)
+    # Level 9 takes 3 to 6 times as long for 1.6 % less.
+    coder = zlib.compressobj(6, wbits=-15)
     data = b"".join([*planes, lidar.tobytes(), intensity.tobytes()])
     return coder.compress(data) + coder.flush()
 
