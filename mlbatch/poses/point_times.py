@@ -1,0 +1,397 @@
+"""Which reading of the times of decoded clouds fits what the lidars see in motion.
+
+A driver states neither whether the header is the start or the end of a sweep nor whether times
+count on from it or back to it, and its clock may be late. Points that are moved by a wrong time
+land at a wrong place. The order of the times within a sweep shows in the motion of one lidar alone:
+in the wrong one its sweeps agree worse with those before. The time between two lidars is solved for
+with the motion, by the surfaces that both see. A time that all lidars share changes nothing and
+stays unknown.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import combinations
+
+import numpy as np
+
+from mlbatch.arrays import BoolArray, F64Array, I64Array
+from mlbatch.motion.estimate import VelocityEstimator
+from mlbatch.motion.registration import Cloud as ColumnCloud
+from mlbatch.motion.se3 import log_rotation
+from mlbatch.poses.solve import FINE, LEVELS, Cloud, Level, Place, Problem, Rows, State, moved, solve
+from mlbatch.poses.surfaces import distances
+from mlbatch.units import NS_PER_S
+
+# Verdicts.
+FITS = "fits"
+DIFFERS = "differs"
+OPEN = "not decided"
+
+# What moves less from one sweep to the next shows no time, m; turns count at this distance, m.
+_LEAST_MOTION_M = 0.08
+_FAR_M = 5.0
+# Sweeps that move, of a lidar whose order is decided; those that are read in both orders, with the
+# first ones, whose map is not complete.
+_FEWEST_SWEEPS = 12
+_MOST_SWEEPS = 40
+_UNSETTLED = 6
+# The order whose residual is smaller: by how many standard errors, by which factor, and in which
+# share of the sweeps.
+_PROVEN = 5.0
+_FACTOR = 1.2
+_SHARE = 0.7
+
+# Instants at which two lidars are compared; those that decide from which delay it begins.
+_SPOTS = 8
+_FIRST_SPOTS = 4
+_FEWEST_SPOTS = 4
+_DELAYS_S = np.arange(-5, 6) * 0.03
+# How well poses of a rig are known: m, rad; and the motion at a spot: m/s, rad/s.
+_POSE_SIGMA = np.repeat([0.03, np.deg2rad(0.5)], 3)
+_TWIST_SIGMA = np.repeat([0.15, 0.03], 3)
+_MOST_POSE_SIGMAS = 3.0
+# Surfaces that are compared; distances at which they agree by half, m.
+_SEEN = Level(1.0, 0.94, 1.0)
+_NEAR_M = 0.15
+_CLOSE_M = 0.02
+# Surfaces of two lidars that agree, a spot.
+_FEWEST_SHARED = 15.0
+# A delay with a larger standard deviation is not known; errors of the model of motion, s.
+_MOST_SIGMA_S = 0.004
+_FLOOR_S = 0.001
+_SIGMAS = 4.0
+_STEPS = 4
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Sweep:
+    """A cloud as the driver cut it: points (n, 3) in the body frame, m; stamp_ns (n,), as read."""
+
+    points_m: F64Array
+    stamp_ns: I64Array
+
+    @property
+    def middle_ns(self) -> int:
+        """Between its first and its last point."""
+        return (int(self.stamp_ns.min()) + int(self.stamp_ns.max())) // 2
+
+    @property
+    def span_s(self) -> float:
+        """From its first to its last point."""
+        return (int(self.stamp_ns.max()) - int(self.stamp_ns.min())) / NS_PER_S
+
+    def times_s(self, from_ns: int, *, is_back: bool) -> F64Array:
+        """Times (n,) from an instant; is_back: in the opposite order within the sweep."""
+        stamp_ns = self.stamp_ns
+        if is_back:
+            stamp_ns = int(stamp_ns.min()) + int(stamp_ns.max()) - stamp_ns
+        found: F64Array = (stamp_ns - from_ns) / NS_PER_S
+        return found
+
+
+@dataclass(frozen=True, slots=True)
+class OrderFit:
+    """Whether the points of a lidar were measured in the order of their times within a sweep.
+
+    verdict: FITS, DIFFERS (in the opposite one) or OPEN, for a reason; residual_m: from each sweep
+    to those before, as read and in the opposite order; sweep_s: length of a sweep.
+    """
+
+    verdict: str
+    reason: str = ""
+    residual_m: tuple[float, float] = (0.0, 0.0)
+    sweep_s: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class DelayFit:
+    """How far the times of a lidar are late against those of the reference lidar.
+
+    verdict: FITS (not late), DIFFERS or OPEN, for a reason; late_s, sigma_s: s, and its standard
+    deviation; residual_m: between surfaces of both, as read and without the delay.
+    """
+
+    verdict: str
+    reason: str = ""
+    late_s: float = 0.0
+    sigma_s: float = 0.0
+    residual_m: tuple[float, float] = (0.0, 0.0)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Track:
+    """Motion of a lidar by its own sweeps, one entry a sweep.
+
+    middle_ns: (n,) int64; residual_m: (n,), to the sweeps before, NaN where they did not match;
+    at_ns: (m,) int64 and twists: (m, 6), where the motion is known.
+    """
+
+    middle_ns: I64Array
+    residual_m: F64Array
+    at_ns: I64Array
+    twists: F64Array
+
+    def twist(self, instant_ns: I64Array) -> F64Array:
+        """Twists (k, 6) at instants (k,), m/s and rad/s."""
+        from_ns = int(self.at_ns[0])
+        return np.stack(
+            [np.interp(instant_ns - from_ns, self.at_ns - from_ns, one) for one in self.twists.T],
+            axis=1,
+        )
+
+    def step_m(self, sweep_s: float) -> F64Array:
+        """How far points move from one sweep to the next (n,)."""
+        if not len(self.at_ns):
+            return np.zeros(len(self.middle_ns))
+        twists = self.twist(self.middle_ns)
+        speed = np.linalg.norm(twists[:, :3], axis=1)
+        found: F64Array = (speed + _FAR_M * np.linalg.norm(twists[:, 3:], axis=1)) * sweep_s
+        return found
+
+
+# -- one lidar -------------------------------------------------------------------------------------
+
+
+def track(sweeps: Sequence[Sweep], *, is_back: bool = False) -> Track:
+    """Motion by sweeps in order of time, as read or in the opposite order within each."""
+    estimator = VelocityEstimator()
+    residual_m, at_ns, twists = [], [], []
+    before_ns = 0
+    for sweep in sweeps:
+        middle_ns = sweep.middle_ns
+        time_s, column = np.unique(
+            sweep.times_s(middle_ns, is_back=is_back), return_inverse=True
+        )
+        cloud = ColumnCloud(sweep.points_m, column, time_s)
+        found = estimator.add(cloud, middle_ns, round(sweep.span_s * NS_PER_S))
+        residual_m.append(np.nan if found.residual_m is None else found.residual_m)
+        if found.velocity is not None and before_ns:
+            # The velocity of a sweep is that from the one before.
+            at_ns.append((before_ns + middle_ns) // 2)
+            twists.append(found.velocity)
+        before_ns = middle_ns
+    return Track(
+        np.array([sweep.middle_ns for sweep in sweeps], np.int64),
+        np.array(residual_m),
+        np.array(at_ns, np.int64),
+        np.array(twists).reshape(-1, 6),
+    )
+
+
+def fit_order(sweeps: Sequence[Sweep], as_read: Track) -> OrderFit:
+    """Compare the order of the times within the sweeps of one lidar with the opposite one."""
+    sweep_s = float(np.median([sweep.span_s for sweep in sweeps])) if sweeps else 0.0
+    moves = as_read.step_m(sweep_s) >= _LEAST_MOTION_M
+    if not len(as_read.at_ns):
+        return OrderFit(OPEN, "the lidar sees too little to follow its motion", sweep_s=sweep_s)
+    if np.count_nonzero(moves) < _FEWEST_SWEEPS:
+        return OrderFit(OPEN, "it stands, or hardly moves", sweep_s=sweep_s)
+    part = _liveliest(moves)
+    back = track(sweeps[part], is_back=True)
+    forth = track(sweeps[part]) if part.start else as_read
+    both = np.stack([forth.residual_m[: len(back.residual_m)], back.residual_m])
+    kept = moves[part] & np.isfinite(both).all(axis=0)
+    kept[:_UNSETTLED] = False
+    if np.count_nonzero(kept) < _FEWEST_SWEEPS - _UNSETTLED:
+        return OrderFit(OPEN, "too few sweeps match those before them", sweep_s=sweep_s)
+    return _decided_order(both[:, kept], sweep_s)
+
+
+def _liveliest(moves: BoolArray) -> slice:
+    """The part of so many sweeps in which most of them move."""
+    length = min(_MOST_SWEEPS, len(moves))
+    sums = np.concatenate([[0], np.cumsum(moves)])
+    first = int(np.argmax(sums[length:] - sums[:-length]))
+    return slice(first, first + length)
+
+
+def _decided_order(both_m: F64Array, sweep_s: float) -> OrderFit:
+    """By residuals (2, n) as read and in the opposite order."""
+    read_m, back_m = np.median(both_m, axis=1).tolist()
+    # Sweeps that follow each other share their map.
+    blocks = np.array_split(both_m[1] - both_m[0], max(2, both_m.shape[1] // 2))
+    change_m = np.array([block.mean() for block in blocks])
+    error_m = change_m.std(ddof=1) / np.sqrt(len(change_m))
+    proof = change_m.mean() / max(error_m, 1e-9)
+    is_back = proof < 0
+    share = float(np.mean((change_m < 0) == is_back))
+    factor = max(read_m, back_m) / max(min(read_m, back_m), 1e-9)
+    is_clear = is_back == (back_m < read_m) and factor >= _FACTOR
+    if abs(proof) < _PROVEN or share < _SHARE or not is_clear:
+        reason = "both orders fit nearly as well"
+        return OrderFit(OPEN, reason, (read_m, back_m), sweep_s)
+    return OrderFit(DIFFERS if is_back else FITS, "", (read_m, back_m), sweep_s)
+
+
+# -- two lidars ------------------------------------------------------------------------------------
+
+
+class _TiedProblem(Problem):
+    """Two lidars with a delay between them, whose poses and motion are nearly known."""
+
+    def __init__(self, places: Sequence[Place], twists: F64Array) -> None:
+        super().__init__(places, 2, delays=True)
+        self._twists = twists
+
+    def rows(self, state: State, level: Level) -> Rows:
+        """Equations of the surfaces, and those that keep what is known."""
+        rows = super().rows(state, level)
+        pose = state.corrections[1]
+        off = np.concatenate([pose.position_m, log_rotation(pose.rotation[None])[0]])
+        self._keep(rows, 0, off / _POSE_SIGMA, _POSE_SIGMA)
+        for place, twist in enumerate(state.twists - self._twists):
+            self._keep(rows, self.poses + 6 * place, twist / _TWIST_SIGMA, _TWIST_SIGMA)
+        return rows
+
+    def _keep(self, rows: Rows, at: int, residual: F64Array, sigma: F64Array) -> None:
+        jacobian = np.zeros((6, self.unknowns))
+        jacobian[:, at : at + 6] = np.diag(1.0 / sigma)
+        rows.jacobian.append(jacobian)
+        rows.residual.append(residual)
+        rows.block.append(-1 - at - np.arange(6))
+        rows.pair.append(np.zeros((6, 2), np.int64))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TimedLidar:
+    """Sweeps of a lidar in order of time, and whether their times run back within each."""
+
+    sweeps: Sequence[Sweep]
+    is_back: bool
+
+    def nearest(self, instant_ns: int) -> Sequence[Sweep]:
+        """Two sweeps in a row around an instant."""
+        middle_ns = np.array([sweep.middle_ns for sweep in self.sweeps])
+        after = int(np.clip(np.searchsorted(middle_ns, instant_ns), 1, len(middle_ns) - 1))
+        return self.sweeps[after - 1 : after + 1]
+
+
+class _Pair:
+    """Two lidars at some instants, with the motion there."""
+
+    def __init__(
+        self, lidars: tuple[TimedLidar, TimedLidar], instants_ns: I64Array, motion: Track
+    ) -> None:
+        self.lidars = lidars
+        self.instants_ns = instants_ns.tolist()
+        self.twists = motion.twist(instants_ns)
+        step_ns = NS_PER_S // 10
+        ends = motion.twist(instants_ns - step_ns), motion.twist(instants_ns + step_ns)
+        self.changes = (ends[1] - ends[0]) / 0.2
+
+    def problem(self, late_s: float, spots: Sequence[int]) -> _TiedProblem:
+        """Clouds of both without the delay, moved by the change of the motion."""
+        places = []
+        for spot in spots:
+            place = []
+            for number, lidar in enumerate(self.lidars):
+                late_ns = round(late_s * NS_PER_S) if number else 0
+                instant_ns = self.instants_ns[spot] + late_ns
+                for sweep in lidar.nearest(instant_ns):
+                    time_s = sweep.times_s(instant_ns, is_back=lidar.is_back)
+                    points_m = moved(sweep.points_m, time_s**2 / 2, self.changes[spot])
+                    place.append(Cloud(number, points_m, time_s))
+            places.append(place)
+        return _TiedProblem(places, self.twists[spots])
+
+    def start(self, spots: Sequence[int]) -> State:
+        """Poses and motion as known, without a delay."""
+        state = State.start(2, len(spots))
+        state.twists = self.twists[spots].copy()
+        return state
+
+
+def fit_delay(
+    reference: TimedLidar, lidar: TimedLidar, motion: Track, sweep_s: float
+) -> DelayFit:
+    """Measure how late the times of a lidar are; motion: of the reference; poses must be known."""
+    instants_ns = _instants(reference, lidar, motion, sweep_s)
+    if len(instants_ns) < _FEWEST_SPOTS:
+        return DelayFit(OPEN, "they move too little while both send")
+    pair = _Pair((reference, lidar), instants_ns, motion)
+    every = list(range(len(instants_ns)))
+    lively = np.argsort(-_steps_m(pair.twists), kind="stable")[:_FIRST_SPOTS].tolist()
+    start = pair.start(lively)
+    tried = []
+    for late_s in _DELAYS_S.tolist():
+        agreed = _Agreement(pair.problem(late_s, lively), start, _NEAR_M)
+        tried.append((agreed.total, late_s))
+    late_s = max(tried)[1]
+    state = pair.start(every)
+    for level in (LEVELS[1], FINE, FINE):
+        solution = solve(pair.problem(late_s, every), state, level, _STEPS)
+        state = solution.state
+        # Sweeps are chosen anew around the instants.
+        change_s = -float(state.delay_s[1])
+        late_s += change_s
+        state.delay_s[1] = 0.0
+    sigma_s = float(np.hypot(np.sqrt(solution.covariance[6, 6]), _FLOOR_S))
+    solved = _Agreement(pair.problem(late_s, every), state, _CLOSE_M)
+    as_read = _Agreement(pair.problem(0.0, every), pair.start(every), _CLOSE_M)
+    residual_m = as_read.residual_m, solved.residual_m
+    if solved.shared < _FEWEST_SHARED * len(every):
+        return DelayFit(OPEN, "they see too little in common", residual_m=residual_m)
+    pose = state.corrections[1]
+    off = np.concatenate([pose.position_m, log_rotation(pose.rotation[None])[0]])
+    if (np.abs(off) > _MOST_POSE_SIGMAS * _POSE_SIGMA).any():
+        return DelayFit(OPEN, "their poses do not fit", late_s, sigma_s, residual_m)
+    if abs(change_s) > sigma_s or sigma_s > _MOST_SIGMA_S:
+        reason = "motion and what both see do not determine it"
+        return DelayFit(OPEN, reason, late_s, sigma_s, residual_m)
+    if abs(late_s) <= _SIGMAS * sigma_s:
+        return DelayFit(FITS, "", late_s, sigma_s, residual_m)
+    return DelayFit(DIFFERS, "", late_s, sigma_s, residual_m)
+
+
+def _steps_m(twists: F64Array) -> F64Array:
+    found: F64Array = np.linalg.norm(twists[:, :3], axis=1) + _FAR_M * np.linalg.norm(
+        twists[:, 3:], axis=1
+    )
+    return found
+
+
+def _instants(
+    reference: TimedLidar, lidar: TimedLidar, motion: Track, sweep_s: float
+) -> I64Array:
+    """Instants in the middle of sweeps of the reference, most of them in motion."""
+    margin_ns = round(2.5 * sweep_s * NS_PER_S)
+    ends = [(one.sweeps[0].middle_ns, one.sweeps[-1].middle_ns) for one in (reference, lidar)]
+    first_ns = max(first for first, _ in ends) + margin_ns
+    last_ns = min(last for _, last in ends) - margin_ns
+    is_inside = (motion.middle_ns >= first_ns) & (motion.middle_ns <= last_ns)
+    is_inside &= np.isfinite(motion.residual_m)
+    moves = is_inside & (motion.step_m(sweep_s) >= _LEAST_MOTION_M)
+    rows = np.flatnonzero(moves)
+    if not len(rows):
+        return np.zeros(0, np.int64)
+    rows = rows[np.unique(np.linspace(0, len(rows) - 1, _SPOTS).round().astype(np.int64))]
+    # At rest poses are seen without the delay.
+    still = np.flatnonzero(is_inside & ~moves)[-1:]
+    return motion.middle_ns[np.union1d(rows, still)]
+
+
+class _Agreement:
+    """Surfaces that agree in a state of a problem.
+
+    total: their number; shared: those of both lidars; residual_m: between these.
+    """
+
+    def __init__(self, problem: Problem, state: State, near_m: float) -> None:
+        self.total = self.shared = 0.0
+        apart_m = []
+        for number, place in enumerate(problem.places):
+            surfaces = problem.clouds(number, state, _SEEN.edge_m)
+            for first, second in combinations(range(len(place)), 2):
+                found = distances(
+                    surfaces[first], surfaces[second], _SEEN.parallel, _SEEN.most_m
+                )
+                square = found.distance_m**2
+                weight = float((1.0 / (1.0 + square / (found.sigma_m**2 + near_m**2))).sum())
+                self.total += weight
+                if place[first].lidar != place[second].lidar:
+                    self.shared += weight
+                    apart_m.append(square)
+        square = np.concatenate(apart_m) if apart_m else np.zeros(0)
+        self.residual_m = float(np.sqrt(square.mean())) if len(square) else 0.0
