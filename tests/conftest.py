@@ -101,6 +101,8 @@ SECONDS = (
     "pipeline/test_conversion.py::test_memory",
     "pipeline/test_inspect.py",
     "pipeline/test_passthrough.py::test_memory",
+    "poses/test_point_times.py::test_inspect",
+    "poses/test_point_times.py::test_readings",
     "readers/capture/test_fragments.py::test_any_traffic",
     "readers/capture/test_frames.py::test_frames_with_any_byte",
     "readers/capture/test_odd.py::test_any_damage",

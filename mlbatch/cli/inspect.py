@@ -96,6 +96,8 @@ def inspect(
         if matrix:
             rows = matrix if fits(matrix) else found.clocks_to_reference()
             _print("", *table_lines(rows))
+    if found.point_times:
+        _print("", *(paragraph(one.describe()) for one in found.point_times))
     for note in found.notes:
         typer.echo(paragraph(f"note: {note}"))
     if write_rig is not None:

@@ -30,6 +30,7 @@ from mlbatch.discovery.sampler import MOST_KINDS, split_by_kind
 from mlbatch.discovery.types import DetectedSensor, PacketKind
 from mlbatch.errors import RecordingError, RigError
 from mlbatch.native.arena import PacketArena
+from mlbatch.pipeline.cloud_times import CloudTimes, TimeFinding
 from mlbatch.pipeline.contents import (
     RecordingReport,
     TopicCounter,
@@ -144,6 +145,7 @@ class Inspection:
     whole: bool = False  # counts, loss and clocks are those of whole recordings
     recordings: tuple[RecordingReport, ...] = ()
     topics: tuple[TopicReport, ...] = ()  # without packets
+    point_times: tuple[TimeFinding, ...] = ()  # of decoded clouds
 
     @property
     def first_host_ns(self) -> int | None:
@@ -208,6 +210,7 @@ class Inspection:
             "streams": [asdict(stream) for stream in self.streams],
             "topics": [asdict(topic) for topic in self.topics],
             "notes": list(self.notes),
+            "point_times": [asdict(one) for one in self.point_times],
             "clocks": {} if self.clocks is None else _clocks_as_json(self.clocks),
         }
 
@@ -315,7 +318,8 @@ def inspect(
     )
     early = frozenset(discovery.sampler.kinds)
     topics = TopicCounter.subscribed(discovery.recordings, (one.topic for one in table.streams))
-    measured = _measure(discovery, topics, progress, whole=whole)
+    cloud_times = CloudTimes(discovery)
+    measured = _measure(discovery, topics, cloud_times, progress, whole=whole)
     types = packet_types(discovery.recordings)
     if not discovery.sampler.kinds and not types:
         _refuse_damaged(discovery)
@@ -345,6 +349,7 @@ def inspect(
         whole=whole,
         recordings=tuple(map(recording_report, discovery.recordings)),
         topics=tuple(topics.reports()),
+        point_times=tuple(cloud_times.findings()),
     )
 
 
@@ -495,12 +500,17 @@ class _Measured:
 
 
 def _measure(
-    discovery: Discovery, topics: TopicCounter, progress: Progress | None, *, whole: bool
+    discovery: Discovery,
+    topics: TopicCounter,
+    cloud_times: CloudTimes,
+    progress: Progress | None,
+    *,
+    whole: bool,
 ) -> _Measured:
     """Loss and clock of each sensor, in the first seconds or the whole session.
 
-    topics: gets the messages of the others; whole: packets of all kinds are counted again, with
-    those that begin later.
+    topics: gets the messages of the others; cloud_times: the decoded clouds; whole: packets of all
+    kinds are counted again, with those that begin later.
     """
     sampler = discovery.sampler
     if whole:
@@ -529,6 +539,7 @@ def _measure(
                 if sampler.count(kind, index, batch):
                     late.add(kind)
         measured.add(batch)
+        cloud_times.add(batch)
     for sensor, sent in zip(discovery.sensors, measured.sent, strict=True):
         sensor.kinds -= late - sent
     return measured

@@ -18,9 +18,10 @@ import numpy as np
 
 from mlbatch.arrays import BoolArray, F64Array, I64Array
 from mlbatch.motion.estimate import VelocityEstimator
+from mlbatch.motion.registration import ORIGIN, Pose
 from mlbatch.motion.registration import Cloud as ColumnCloud
-from mlbatch.motion.se3 import log_rotation
-from mlbatch.poses.solve import FINE, LEVELS, Cloud, Level, Place, Problem, Rows, State, moved, solve
+from mlbatch.motion.se3 import exp_rotation, log_rotation
+from mlbatch.poses.solve import FINE, LEVELS, Cloud, Level, Place, Problem, State, moved
 from mlbatch.poses.surfaces import distances
 from mlbatch.units import NS_PER_S
 
@@ -63,6 +64,8 @@ _MOST_SIGMA_S = 0.004
 _FLOOR_S = 0.001
 _SIGMAS = 4.0
 _STEPS = 4
+# Cauchy kernel: residuals of this many standard deviations have half of their weight.
+_KERNEL = 2.5
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -161,9 +164,7 @@ def track(sweeps: Sequence[Sweep], *, is_back: bool = False) -> Track:
     before_ns = 0
     for sweep in sweeps:
         middle_ns = sweep.middle_ns
-        time_s, column = np.unique(
-            sweep.times_s(middle_ns, is_back=is_back), return_inverse=True
-        )
+        time_s, column = np.unique(sweep.times_s(middle_ns, is_back=is_back), return_inverse=True)
         cloud = ColumnCloud(sweep.points_m, column, time_s)
         found = estimator.add(cloud, middle_ns, round(sweep.span_s * NS_PER_S))
         residual_m.append(np.nan if found.residual_m is None else found.residual_m)
@@ -228,30 +229,65 @@ def _decided_order(both_m: F64Array, sweep_s: float) -> OrderFit:
 # -- two lidars ------------------------------------------------------------------------------------
 
 
-class _TiedProblem(Problem):
-    """Two lidars with a delay between them, whose poses and motion are nearly known."""
+class _Solution:
+    """Least squares for the delay of the second of two lidars, its pose and the motion at spots.
+
+    Pose and motion are nearly known. sigma_s: of the delay, if surfaces in one sector are one
+    observation.
+    """
 
     def __init__(self, places: Sequence[Place], twists: F64Array) -> None:
-        super().__init__(places, 2, delays=True)
-        self._twists = twists
+        self._problem = Problem(places, 2, delays=True)
+        self._known = twists
+        self._sigma = np.concatenate([_POSE_SIGMA, [1.0], np.tile(_TWIST_SIGMA, len(twists))])
+        self.sigma_s = np.inf
 
-    def rows(self, state: State, level: Level) -> Rows:
-        """Equations of the surfaces, and those that keep what is known."""
-        rows = super().rows(state, level)
+    def solve(self, state: State, level: Level) -> State:
+        """Some steps of Gauss-Newton; surfaces are matched anew in each."""
+        for _ in range(_STEPS):
+            state = self._after(state, self._step(state, level))
+        return state
+
+    def _step(self, state: State, level: Level) -> F64Array:
+        """Change of pose, delay and twists (7 + 6 k,)."""
+        size = len(self._sigma)
         pose = state.corrections[1]
-        off = np.concatenate([pose.position_m, log_rotation(pose.rotation[None])[0]])
-        self._keep(rows, 0, off / _POSE_SIGMA, _POSE_SIGMA)
-        for place, twist in enumerate(state.twists - self._twists):
-            self._keep(rows, self.poses + 6 * place, twist / _TWIST_SIGMA, _TWIST_SIGMA)
-        return rows
+        off = np.concatenate([pose_off(pose), state.delay_s[1:], *(state.twists - self._known)])
+        normal = np.diag(self._sigma**-2.0)
+        gradient = off * self._sigma**-2.0
+        scores: dict[int, F64Array] = {}
+        for place, rows in enumerate(self._problem.rows(state, level)):
+            columns = np.concatenate([np.arange(7), 7 + 6 * place + np.arange(6)])
+            residual = rows.residual / rows.scale
+            jacobian = rows.jacobian / rows.scale
+            weighted = jacobian / (1.0 + (residual / _KERNEL) ** 2)[:, None]
+            normal[np.ix_(columns, columns)] += np.matmul(weighted.T, jacobian)
+            by_row = weighted * residual[:, None]
+            gradient[columns] += by_row.sum(axis=0)
+            for block in np.unique(rows.block).tolist():
+                score = scores.setdefault(block, np.zeros(size))
+                score[columns] += by_row[rows.block == block].sum(axis=0)
+        inverse = np.linalg.inv(normal)
+        variance = sum(float(np.dot(inverse[6], score)) ** 2 for score in scores.values())
+        self.sigma_s = float(np.sqrt(max(variance, inverse[6, 6])))
+        found: F64Array = -np.matmul(inverse, gradient)
+        return found
 
-    def _keep(self, rows: Rows, at: int, residual: F64Array, sigma: F64Array) -> None:
-        jacobian = np.zeros((6, self.unknowns))
-        jacobian[:, at : at + 6] = np.diag(1.0 / sigma)
-        rows.jacobian.append(jacobian)
-        rows.residual.append(residual)
-        rows.block.append(-1 - at - np.arange(6))
-        rows.pair.append(np.zeros((6, 2), np.int64))
+    @staticmethod
+    def _after(state: State, step: F64Array) -> State:
+        pose = state.corrections[1]
+        turn = exp_rotation(step[None, 3:6])[0]
+        moved_m = np.matmul(turn, pose.position_m) + step[:3]
+        return State(
+            [ORIGIN, Pose(np.matmul(turn, pose.rotation), moved_m)],
+            state.twists + step[7:].reshape(-1, 6),
+            state.delay_s + np.array([0.0, step[6]]),
+        )
+
+
+def pose_off(pose: Pose) -> F64Array:
+    """Shift and turn of a correction (6,), m and rad."""
+    return np.concatenate([pose.position_m, log_rotation(pose.rotation[None])[0]])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -281,7 +317,7 @@ class _Pair:
         ends = motion.twist(instants_ns - step_ns), motion.twist(instants_ns + step_ns)
         self.changes = (ends[1] - ends[0]) / 0.2
 
-    def problem(self, late_s: float, spots: Sequence[int]) -> _TiedProblem:
+    def places(self, late_s: float, spots: Sequence[int]) -> list[list[Cloud]]:
         """Clouds of both without the delay, moved by the change of the motion."""
         places = []
         for spot in spots:
@@ -294,7 +330,7 @@ class _Pair:
                     points_m = moved(sweep.points_m, time_s**2 / 2, self.changes[spot])
                     place.append(Cloud(number, points_m, time_s))
             places.append(place)
-        return _TiedProblem(places, self.twists[spots])
+        return places
 
     def start(self, spots: Sequence[int]) -> State:
         """Poses and motion as known, without a delay."""
@@ -303,9 +339,7 @@ class _Pair:
         return state
 
 
-def fit_delay(
-    reference: TimedLidar, lidar: TimedLidar, motion: Track, sweep_s: float
-) -> DelayFit:
+def fit_delay(reference: TimedLidar, lidar: TimedLidar, motion: Track, sweep_s: float) -> DelayFit:
     """Measure how late the times of a lidar are; motion: of the reference; poses must be known."""
     instants_ns = _instants(reference, lidar, motion, sweep_s)
     if len(instants_ns) < _FEWEST_SPOTS:
@@ -316,26 +350,24 @@ def fit_delay(
     start = pair.start(lively)
     tried = []
     for late_s in _DELAYS_S.tolist():
-        agreed = _Agreement(pair.problem(late_s, lively), start, _NEAR_M)
+        agreed = _Agreement(pair.places(late_s, lively), start, _NEAR_M)
         tried.append((agreed.total, late_s))
     late_s = max(tried)[1]
     state = pair.start(every)
     for level in (LEVELS[1], FINE, FINE):
-        solution = solve(pair.problem(late_s, every), state, level, _STEPS)
-        state = solution.state
+        solution = _Solution(pair.places(late_s, every), pair.twists)
+        state = solution.solve(state, level)
         # Sweeps are chosen anew around the instants.
         change_s = -float(state.delay_s[1])
         late_s += change_s
         state.delay_s[1] = 0.0
-    sigma_s = float(np.hypot(np.sqrt(solution.covariance[6, 6]), _FLOOR_S))
-    solved = _Agreement(pair.problem(late_s, every), state, _CLOSE_M)
-    as_read = _Agreement(pair.problem(0.0, every), pair.start(every), _CLOSE_M)
+    sigma_s = float(np.hypot(solution.sigma_s, _FLOOR_S))
+    solved = _Agreement(pair.places(late_s, every), state, _CLOSE_M)
+    as_read = _Agreement(pair.places(0.0, every), pair.start(every), _CLOSE_M)
     residual_m = as_read.residual_m, solved.residual_m
     if solved.shared < _FEWEST_SHARED * len(every):
         return DelayFit(OPEN, "they see too little in common", residual_m=residual_m)
-    pose = state.corrections[1]
-    off = np.concatenate([pose.position_m, log_rotation(pose.rotation[None])[0]])
-    if (np.abs(off) > _MOST_POSE_SIGMAS * _POSE_SIGMA).any():
+    if (np.abs(pose_off(state.corrections[1])) > _MOST_POSE_SIGMAS * _POSE_SIGMA).any():
         return DelayFit(OPEN, "their poses do not fit", late_s, sigma_s, residual_m)
     if abs(change_s) > sigma_s or sigma_s > _MOST_SIGMA_S:
         reason = "motion and what both see do not determine it"
@@ -352,9 +384,7 @@ def _steps_m(twists: F64Array) -> F64Array:
     return found
 
 
-def _instants(
-    reference: TimedLidar, lidar: TimedLidar, motion: Track, sweep_s: float
-) -> I64Array:
+def _instants(reference: TimedLidar, lidar: TimedLidar, motion: Track, sweep_s: float) -> I64Array:
     """Instants in the middle of sweeps of the reference, most of them in motion."""
     margin_ns = round(2.5 * sweep_s * NS_PER_S)
     ends = [(one.sweeps[0].middle_ns, one.sweeps[-1].middle_ns) for one in (reference, lidar)]
@@ -369,7 +399,8 @@ def _instants(
     rows = rows[np.unique(np.linspace(0, len(rows) - 1, _SPOTS).round().astype(np.int64))]
     # At rest poses are seen without the delay.
     still = np.flatnonzero(is_inside & ~moves)[-1:]
-    return motion.middle_ns[np.union1d(rows, still)]
+    found: I64Array = motion.middle_ns[np.union1d(rows, still)]
+    return found
 
 
 class _Agreement:
@@ -378,15 +409,14 @@ class _Agreement:
     total: their number; shared: those of both lidars; residual_m: between these.
     """
 
-    def __init__(self, problem: Problem, state: State, near_m: float) -> None:
+    def __init__(self, places: Sequence[Place], state: State, near_m: float) -> None:
+        problem = Problem(places, 2)
         self.total = self.shared = 0.0
         apart_m = []
-        for number, place in enumerate(problem.places):
+        for number, place in enumerate(places):
             surfaces = problem.clouds(number, state, _SEEN.edge_m)
             for first, second in combinations(range(len(place)), 2):
-                found = distances(
-                    surfaces[first], surfaces[second], _SEEN.parallel, _SEEN.most_m
-                )
+                found = distances(surfaces[first], surfaces[second], _SEEN.parallel, _SEEN.most_m)
                 square = found.distance_m**2
                 weight = float((1.0 / (1.0 + square / (found.sigma_m**2 + near_m**2))).sum())
                 self.total += weight

@@ -343,10 +343,10 @@ _POINT_UNIT = Key(
 )
 _POINT_ORIGIN = Key(
     "from",
-    _choice("start", "end", "absolute"),
+    _choice("start", "end", "back", "absolute"),
     "",
-    choice_form("start", "end", "absolute"),
-    "the header's stamp is that of the first point, of the last one; or times count from 1970",
+    choice_form("start", "end", "back", "absolute"),
+    "the header's stamp is that of the first point, of the last one; times are ages; or from 1970",
 )
 _POINT_RING = Key("ring", _word("the name of a field"), "", WORD, "field with the ring of a point")
 # Of a sensor_msgs/PointField.

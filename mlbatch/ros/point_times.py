@@ -27,8 +27,10 @@ TIME_NAMES = ("t", "time", "timestamp", "time_stamp", "timestamps", "offset_time
 UNITS_NS: Mapping[str, int] = {"s": NS_PER_S, "ms": NS_PER_MS, "us": NS_PER_US, "ns": 1}
 START = "start"
 END = "end"
+# Ages: each point was measured that long before the header's stamp.
+BACK = "back"
 ABSOLUTE = "absolute"
-ORIGINS = (START, END, ABSOLUTE)
+ORIGINS = (START, END, BACK, ABSOLUTE)
 
 _LIMIT_NS = 2**31 * NS_PER_S
 # Times of points after a header; times since 1970 are far above (1e8 s is 1973).
@@ -150,6 +152,9 @@ def stamps(time: Times, zero: Zero, rule: PointRule, all_times: Times) -> tuple[
         words = "up to"
         if not _counts_back(low, high):
             ns -= _last_ns(all_times, high, unit_ns, rule.longest_ns)
+    elif rule.origin == BACK:
+        words = "before"
+        np.negative(ns, out=ns)
     ns += zero.base_ns
     return ns, f"{zero.field}, {unit} {words} {zero.base}{why}"
 
@@ -173,6 +178,9 @@ def _check_direction(low: float, high: float, unit_ns: int, zero: Zero, origin: 
             "(from: end)"
         )
         is_allowed = high_ns <= _PACKET_NS if is_back else low_ns >= -_PACKET_NS
+    elif origin == BACK:
+        expected = f"times of 0 and more, each that long before {zero.base} (from: back)"
+        is_allowed = low_ns >= -_PACKET_NS
     else:
         return
     if is_allowed:
@@ -368,6 +376,21 @@ def checked_rule(
     return rule, notes
 
 
+def origin_as_read(samples: Sequence[CloudSample], rule: PointRule) -> str:
+    """The origin of ORIGINS by which a topic is read; "" where times count back from the header."""
+    usable = [one for one in samples if one.points > 1]
+    if not usable or rule.origin:
+        return rule.origin
+    sample = usable[-1]
+    if rule.unit_ns:
+        reading: Reading | None = _by_unit(sample.high, rule.unit_ns)
+    else:
+        reading = convention(sample.kind, sample.high)
+    if reading is not None and reading.is_absolute:
+        return ABSOLUTE
+    return "" if _counts_back(sample.low, sample.high) else START
+
+
 def ahead_ns(samples: Sequence[CloudSample], rule: PointRule) -> int | None:
     """How far the last points of a topic are ahead of the log times of their messages, at most.
 
@@ -392,6 +415,8 @@ def _last_stamp_ns(sample: CloudSample, rule: PointRule) -> int | None:
         return round(sample.high * reading.unit_ns)
     if rule.origin == END and not _counts_back(sample.low, sample.high):
         return sample.zero.base_ns
+    if rule.origin == BACK:
+        return sample.zero.base_ns - round(sample.low * reading.unit_ns)
     return sample.zero.base_ns + round(sample.high * reading.unit_ns)
 
 

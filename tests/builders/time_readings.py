@@ -28,22 +28,14 @@ seed: {seed}
 duration_s: {duration_s}
 truth: {{rate_hz: 100}}
 """
-_SENSORS = """\
-sensors:
-  - name: left
+_SENSOR = """\
+  - name: {name}
     model: OS1-32
     columns: 512
-    phase_deg: {left_deg:.1f}
+    phase_deg: {phase_deg:.1f}
     dropout: 0.02
-    noise_m: {noise_m}
-    extrinsics: {{translation_m: [{left[0]:.3f}, {left[1]:.3f}, {left[2]:.3f}], rotation_rpy_deg: [{left[3]:.3f}, {left[4]:.3f}, {left[5]:.3f}]}}
-  - name: right
-    model: OS1-32
-    columns: 512
-    phase_deg: {right_deg:.1f}
-    dropout: 0.02
-    noise_m: {noise_m}
-    extrinsics: {{translation_m: [{right[0]:.3f}, {right[1]:.3f}, {right[2]:.3f}], rotation_rpy_deg: [{right[3]:.3f}, {right[4]:.3f}, {right[5]:.3f}]}}
+    noise_m: 0.01
+    extrinsics: {{translation_m: [{x:.3f}, {y:.3f}, {z:.3f}], rotation_rpy_deg: [{rpy}]}}
 """
 
 
@@ -98,7 +90,9 @@ def scenario(seed: int, *, moving: bool = True, duration_s: float = 4.0) -> str:
     lines, places = [], []
     times = np.arange(0.0, duration_s + 4.0, 1.0)
     for time_s in times:
-        lines.append(f"    - [{time_s:g}, {at[0]:.3f}, {at[1]:.3f}, 0.3, {np.rad2deg(heading):.2f}]")
+        lines.append(
+            f"    - [{time_s:g}, {at[0]:.3f}, {at[1]:.3f}, 0.3, {np.rad2deg(heading):.2f}]"
+        )
         places.append(at.copy())
         step = speed * rng.uniform(0.8, 1.2)
         heading += np.deg2rad(turn_deg * rng.uniform(0.5, 1.5))
@@ -129,15 +123,12 @@ def scenario(seed: int, *, moving: bool = True, duration_s: float = 4.0) -> str:
         f"    - {{corner_m: [{low[0]:.1f}, {low[1]:.1f}, 0], along_m: [180, 0, 0], "
         "across_m: [0, 180, 0], reflectivity: 30}\n  boxes:\n" + "\n".join(boxes) + "\n"
     )
-    sensors = _SENSORS.format(
-        left_deg=rng.uniform(0, 360),
-        right_deg=rng.uniform(0, 360),
-        noise_m=0.01,
-        left=np.concatenate([rng.uniform([-1, 0.3, 1.5], [1, 1, 2.5]), rng.uniform(-15, 15, 2),
-                             rng.uniform(-180, 180, 1)]),
-        right=np.concatenate([rng.uniform([-1, -1, 1.5], [1, -0.3, 2.5]), rng.uniform(-15, 15, 2),
-                              rng.uniform(-180, 180, 1)]),
-    )  # fmt: skip
+    sensors = "sensors:\n"
+    for name, side in zip(NAMES, (1.0, -1.0), strict=True):
+        x, y, z = rng.uniform([-1.0, 0.3, 1.5], [1.0, 1.0, 2.5])
+        rpy = ", ".join(f"{angle:.3f}" for angle in rng.uniform([-15, -15, -180], [15, 15, 180]))
+        phase_deg = rng.uniform(0, 360)
+        sensors += _SENSOR.format(name=name, phase_deg=phase_deg, x=x, y=side * y, z=z, rpy=rpy)
     return _HEAD.format(seed=seed, duration_s=duration_s) + motion + scene + sensors
 
 

@@ -170,8 +170,8 @@ MISTAKES: list[tuple[str, str]] = [
     (one("stream: {topic: /a}\n    points:\n      unit: min"),
      f"5: {S}.points.unit: expected s or ms or us or ns, found 'min'; use one of these words"),
     (one("stream: {topic: /a}\n    points: {from: middle}"),
-     f"4: {S}.points.from: expected start or end or absolute, found 'middle'; "
-     "use one of these words"),
+     f"4: {S}.points.from: expected start or end or back or absolute, found "
+     "'middle'; use one of these words"),
     (one("stream: {topic: /a}\n    points: {}"),
      f"4: {S}.points: expected at least one of time, unit, from, ring, glob, dtype, found none; "
      "add one of them"),

@@ -16,7 +16,14 @@ from mlbatch.readers.merge import merge
 from mlbatch.rig.rig import RigSensor
 from mlbatch.ros.encoding import ENCODINGS
 from mlbatch.ros.point_packets import CloudError, Layout
-from mlbatch.ros.point_times import CONVENTION, CloudSample, PointRule, ahead_ns, checked_rule
+from mlbatch.ros.point_times import (
+    CONVENTION,
+    CloudSample,
+    PointRule,
+    ahead_ns,
+    checked_rule,
+    origin_as_read,
+)
 from mlbatch.ros.pointcloud2 import CLOUD_TYPES, FieldError, read_cloud, sample_cloud
 from mlbatch.types import Message, Recording, Stream, Topic
 from mlbatch.units import NS_PER_S
@@ -68,8 +75,9 @@ class CloudTopics:
     rules: by topic and frame_id; lidars: by topic; layouts: of the packets of each stream; frames:
     frame_id of each stream; first_points_only: whether all but the first cloud of a stream may be
     cut after their first points; refused: why topics cannot be used; ahead_ns: by topic
-    and frame_id, the last points minus the log times; warnings: topic and text; stamps_ns: of the
-    headers of the first messages, by topic.
+    and frame_id, the last points minus the log times; origins: by topic and frame_id, as of
+    `origin_as_read`; warnings: topic and text; stamps_ns: of the headers of the first messages, by
+    topic.
     """
 
     topics: tuple[Topic, ...]
@@ -82,6 +90,7 @@ class CloudTopics:
     first_points_only: bool = False
     refused: dict[str, str] = field(default_factory=dict)
     ahead_ns: dict[tuple[str, str], int | None] = field(default_factory=dict)
+    origins: dict[tuple[str, str], str] = field(default_factory=dict)
     warnings: list[tuple[str, str]] = field(default_factory=list)
     stamps_ns: dict[str, set[int]] = field(default_factory=dict)
 
@@ -216,6 +225,7 @@ class CloudTopics:
                 rule, texts = checked_rule(samples, self._given(name, frame), name, offset_ns)
                 self.rules.setdefault((name, frame), rule)
                 self.ahead_ns.setdefault((name, frame), ahead_ns(samples, rule))
+                self.origins.setdefault((name, frame), origin_as_read(samples, rule))
                 notes |= dict.fromkeys(texts)
             for message in examined.clouds.values():
                 read_cloud(message, lambda frame: self.rule(name, frame))
