@@ -74,7 +74,7 @@ class TimeFinding:
             text += f"; against {self.reference}: {self._delay()}"
         if self.set:
             keys = ", ".join(f"{name}: {value}" for name, value in self.set.items())
-            text += f"; write in the rig: {keys}"
+            text += f"; if the poses are right, write in the rig: {keys}"
         return text
 
     def _order(self) -> str:
