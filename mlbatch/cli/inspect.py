@@ -98,6 +98,8 @@ def inspect(
             _print("", *table_lines(rows))
     if found.point_times:
         _print("", *(paragraph(one.describe()) for one in found.point_times))
+    if found.poses is not None:
+        _print("", *map(paragraph, found.pose_lines()))
     for note in found.notes:
         typer.echo(paragraph(f"note: {note}"))
     if write_rig is not None:

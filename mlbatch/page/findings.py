@@ -276,12 +276,14 @@ def _clocks(report: RunReport) -> Iterator[Finding]:
 
 
 def _poses(report: RunReport) -> Iterator[Finding]:
-    """What lidars see in common; poses that are wrong have a warning."""
+    """What lidars see in common; wrong poses that were given have a warning."""
     pairs = () if report.poses is None else report.poses.pairs
+    has_warning = any(one.code == "pose" for one in report.warnings)
     for pair in pairs:
-        if not pair.is_wrong:
-            text = pair.describe()
-            yield Finding(Level.NOTE, f"Poses: {text}.")
+        if not (pair.is_wrong and has_warning):
+            level = Level.WARNING if pair.is_wrong else Level.NOTE
+            remedy = REMEDIES["pose"] if pair.is_wrong else ""
+            yield Finding(level, f"Poses: {pair.describe()}.", remedy)
 
 
 def _faults(report: RunReport) -> Iterator[Finding]:

@@ -137,7 +137,7 @@ class Conversion:
         self.notes_before_points = 0
         self.deskew = self._deskew()
         self.poses = PoseFigures(ONE_LIDAR if job.checks_poses else NOT_ASKED)
-        self._pose_check = self._new_pose_check()
+        self.pose_check = self._new_pose_check()
         self._buffers = buffers
         self._pool: DecodePool | None = None
         if job.max_wait_ns is None:
@@ -264,8 +264,8 @@ class Conversion:
 
     def _batches(self, windows: Iterator[Window]) -> Iterator[Window]:
         """Yield what becomes a scan: windows, or the sets of sweeps in them, with their moves."""
-        if self._pose_check is not None:
-            windows = self._checked(windows, self._pose_check)
+        if self.pose_check is not None:
+            windows = self._checked(windows, self.pose_check)
         batches = windows if self.fusion is None else self.fusion.sets(windows)
         if self.deskew is None:
             yield from batches
@@ -457,8 +457,8 @@ class Conversion:
         for sensor in self.sensors:
             self._complete_ledger(sensor)
         self._refuse_rejected()
-        if self._pose_check is not None:
-            self.poses = self._pose_check.figures()
+        if self.pose_check is not None:
+            self.poses = self.pose_check.figures()
         for note in run_report.final_notes(self):
             self.warn(note)
         self.notes_before_points = len(self.notes)

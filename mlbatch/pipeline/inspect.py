@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
@@ -28,7 +29,7 @@ from mlbatch.discovery.overlap import SharedLidars, iso
 from mlbatch.discovery.router import Role
 from mlbatch.discovery.sampler import MOST_KINDS, split_by_kind
 from mlbatch.discovery.types import DetectedSensor, PacketKind
-from mlbatch.errors import RecordingError, RigError
+from mlbatch.errors import MlbatchError, RecordingError, RigError
 from mlbatch.native.arena import PacketArena
 from mlbatch.pipeline.cloud_times import CloudTimes, TimeFinding
 from mlbatch.pipeline.contents import (
@@ -42,6 +43,8 @@ from mlbatch.pipeline.job import Job
 from mlbatch.pipeline.session import sensors_of
 from mlbatch.readers import open_recordings
 from mlbatch.readers.bag.clouds import CloudRecording
+from mlbatch.report.json_records import to_json
+from mlbatch.report.poses import PoseFigures
 from mlbatch.rig.rig import (
     DEFAULT_BODY_FRAME,
     Rig,
@@ -57,6 +60,8 @@ from mlbatch.units import NS_PER_MS, NS_PER_S
 Progress = Callable[[int, int], object]
 # Fewer pairs of clocks are described in words, not by a matrix.
 _FEWEST_PAIRS = 3
+# Windows from which poses are checked.
+_MOST_WINDOWS = 32
 MS_PER_S = NS_PER_S // NS_PER_MS
 HEAD = (
     "stream",
@@ -146,6 +151,7 @@ class Inspection:
     recordings: tuple[RecordingReport, ...] = ()
     topics: tuple[TopicReport, ...] = ()  # without packets
     point_times: tuple[TimeFinding, ...] = ()  # of decoded clouds
+    poses: PoseFigures | None = None  # None: one lidar
 
     @property
     def first_host_ns(self) -> int | None:
@@ -212,7 +218,15 @@ class Inspection:
             "notes": list(self.notes),
             "point_times": [asdict(one) for one in self.point_times],
             "clocks": {} if self.clocks is None else _clocks_as_json(self.clocks),
+            **({} if self.poses is None else {"poses": to_json(self.poses)}),
         }
+
+    def pose_lines(self) -> list[str]:
+        """How the surfaces that lidars see fit, as text."""
+        if self.poses is None:
+            return []
+        known = [pair for pair in self.poses.pairs if pair.is_known]
+        return [f"poses: {pair.describe()}" for pair in known] or [self.poses.describe()]
 
     def clock_lines(self) -> list[str]:
         """Verdicts on the clocks, as text; of many pairs only the ones that need attention."""
@@ -350,7 +364,34 @@ def inspect(
         recordings=tuple(map(recording_report, discovery.recordings)),
         topics=tuple(topics.reports()),
         point_times=tuple(cloud_times.findings()),
+        poses=_poses(discovery, Job(tuple(recordings), SensorSelection(rig, tuple(metadata)))),
     )
+
+
+def _poses(discovery: Discovery, job: Job) -> PoseFigures | None:
+    """The check of the poses by the first windows; None for one lidar."""
+    if len(discovery.sensors) < 2:
+        return None
+    unknown = [sensor.name for sensor in discovery.sensors if not sensor.pose.is_known]
+    if unknown:
+        return PoseFigures(f"the pose of {', '.join(unknown)} is not known")
+    # Not loaded where poses are not known.
+    from mlbatch.pipeline.conversion import Conversion
+
+    try:
+        run = Conversion(job)
+        check = run.pose_check
+        if check is None:
+            return None
+        with contextlib.closing(run.windows()) as windows:
+            for window in windows:
+                check.add(window)
+                if check.is_over or window.index >= _MOST_WINDOWS:
+                    break
+        return check.figures()
+    except MlbatchError:
+        # What is wrong, `convert` says.
+        return PoseFigures("the recording cannot be converted as it is")
 
 
 def _late_notes(discovery: Discovery, early: Collection[PacketKind]) -> Iterator[str]:

@@ -72,6 +72,11 @@ class PoseCheck:
             self._place = {}
             self._next = 2 * self._next + 1
 
+    @property
+    def is_over(self) -> bool:
+        """Whether more windows would change nothing."""
+        return self._is_over
+
     def figures(self) -> PoseFigures:
         """What is known of each pair of lidars."""
         if self._comparison is None:

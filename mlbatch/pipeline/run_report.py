@@ -148,9 +148,10 @@ def _epoch_notes(run: Conversion) -> Iterator[Note]:
 
 
 def _pose_notes(run: Conversion) -> Iterator[Note]:
-    """Lidars whose surfaces are proven to be apart."""
+    """Lidars whose surfaces are proven to be apart, unless they have no pose of their own."""
+    placed = {sensor.name for sensor in run.sensors if sensor.detected.pose.is_known}
     for pair in run.poses.pairs:
-        if pair.is_wrong:
+        if pair.is_wrong and placed.issuperset(pair.lidars):
             text = (
                 f"{pair.describe()}; correct the poses in the rig file (--rig), or measure them "
                 "(mlbatch calibrate)"

@@ -144,7 +144,7 @@ def test_clocks_of_many_sensors_are_a_matrix(shell: Shell, tmp_path: Path) -> No
     outcome = shell(f"inspect {capture}")
     assert outcome.code == 0
     text = outcome.out[outcome.out.index("clock minus clock") :]
-    rows = [re.split(r" {2,}", line) for line in text.splitlines()]
+    rows = [re.split(r" {2,}", line) for line in text.splitlines()[:4]]
     assert rows[0] == ["clock minus clock", "1", "2", "3"]
     assert [row[0] for row in rows[1:]] == ["1 ouster_111", "2 ouster_222", "3 ouster_333"]
     found = [[float(cell.removesuffix(" ms")) for cell in row[1:]] for row in rows[1:]]

@@ -51,7 +51,8 @@ def _streams(shell: Shell, arguments: str) -> list[dict[str, Any]]:
 def test_the_table_of_the_fixture(shell: Shell) -> None:
     outcome = shell(f"inspect {CAPTURE}")
     assert (outcome.code, outcome.err) == (0, "")
-    table_text, recordings, clocks = outcome.out.split("\n\n")
+    table_text, recordings, clocks, poses = outcome.out.split("\n\n")
+    assert poses == f"poses: not checked (the pose of {LEFT}, {RIGHT} is not known)\n"
     head, *rows = table_text.splitlines()
     starts = [head.index(word) for word in head.split()]
     ends = [*starts[1:], None]

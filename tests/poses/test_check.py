@@ -234,3 +234,11 @@ def test_a_verdict_says_what_it_covers() -> None:
     assert PoseFigures(pairs=(PAIR, other)).describe() == (
         "surfaces agree within 8 mm, 0.05 degrees, of 1 of 2 pairs of lidars"
     )
+
+
+def test_inspect_shows_the_check() -> None:
+    shown = command("inspect", CAPTURE, "--rig", RIG, "--json")
+    (pair,) = json.loads(shown.out)["poses"]["pairs"]
+    assert pair["outcome"] == MEASURED
+    text = command("inspect", CAPTURE, "--rig", RIG).out
+    assert "\nposes: left and right have 54 % of their surfaces in common; they agree" in text
