@@ -57,6 +57,8 @@ _IN_DIRECTIONS = 0.5
 _MOST_DELAY_SIGMA_S = 0.002
 # Shorter delays do not move poses by more than they may be off, s.
 _LEAST_DELAY_S = 0.002
+# A machine that is slower is at rest.
+_AT_REST_MPS, _AT_REST_RADPS = 0.05, 0.01
 # Digits of poses that are written: micrometres, and degrees.
 _DIGITS = 6
 _MS_PER_S = 1000.0
@@ -119,8 +121,8 @@ class Calibration:
     """Poses of all lidars, and how well they fit.
 
     places: number that the poses were solved on; held_out: number that they were measured on;
-    different: with a view of their own; windows: of the recording; steps: windows whose motion
-    was used (--from-motion); view: a picture, None of poses from motion alone.
+    different: places between which the machine moved; windows: of the recording; steps: windows
+    whose motion was used (--from-motion); view: a picture, None of poses from motion alone.
     """
 
     lidars: tuple[LidarPose, ...]
@@ -260,15 +262,15 @@ def calibrated(
     )
     _refuse_disagreement(pairs)
     _refuse_apart(found, again, names, refined)
+    different = _different(found.state.twists)
     # Places with one view are not independent.
-    doubt = max(1.0, len(places.kept) / max(1, places.different))
-    doubt = max(doubt, _disagreement(found, again, refined))
+    doubt = max(1.0, len(fitted) / different, _disagreement(found, again, refined))
     return Calibration(
         _lidar_poses(found, names, guessed, refined, doubt, delays=delays),
         pairs,
         len(fitted),
         len(held_out),
-        places.different,
+        different,
         places.windows,
         _view(held_out, begin, found.state, twists),
     )
@@ -449,6 +451,13 @@ def _differences(
             (np.matmul(there, off), np.matmul(np.matmul(there, covariance), there.T))
         )
     return differences
+
+
+def _different(twists: F64Array) -> int:
+    """Number of places (k, 6) between which the machine moved."""
+    speed, turn = np.linalg.norm(twists[:, :3], axis=1), np.linalg.norm(twists[:, 3:], axis=1)
+    rests = (speed < _AT_REST_MPS) & (turn < _AT_REST_RADPS)
+    return len(rests) - int((rests[1:] & rests[:-1]).sum())
 
 
 def _disagreement(found: Solution, again: Solution, poses: Sequence[F64Array]) -> float:

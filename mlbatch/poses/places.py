@@ -2,7 +2,7 @@
 
 They are spread over the recording, whose length need not be known: of those that are kept every
 second one goes when they are too many, and from then on every second one is skipped. A view that
-was kept before tells nothing new, so that a machine at rest is one place.
+was kept before shows nothing new, so that few places of a machine at rest are kept.
 """
 
 from __future__ import annotations
@@ -50,12 +50,10 @@ class KeptPlace:
 class Places:
     """Places of a recording in the order of time.
 
-    different: places with a view of their own; windows: of the recording; lacking: by lidar,
-    windows without enough points of it.
+    windows: of the recording; lacking: by lidar, windows without enough points of it.
     """
 
     kept: list[KeptPlace]
-    different: int
     windows: int
     lacking: list[int]
 
@@ -109,7 +107,7 @@ class _Begun:
 def places_of(scans: Iterable[Scan], lidars: int) -> Places:
     """Choose places of the scans of a recording; arrays of a scan are read before the next."""
     moved, at_rest = _Spread(MOST_PLACES), _Spread(_MOST_AT_REST)
-    found = Places([], 0, 0, [0] * lidars)
+    found = Places([], 0, [0] * lidars)
     begun: _Begun | None = None
     view = np.full(_DIRECTIONS, np.inf)
     for scan in scans:
@@ -134,7 +132,6 @@ def places_of(scans: Iterable[Scan], lidars: int) -> Places:
                 begun = _Begun(spread, clouds, scan.start_ns, scan.end_ns, seen)
             else:
                 spread.count += 1
-    found.different = len(moved.kept)
     kept = moved.kept + at_rest.kept[: max(0, _MOST_AT_REST - len(moved.kept))]
     found.kept = sorted(kept, key=lambda one: one.start_ns)
     return found

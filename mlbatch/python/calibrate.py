@@ -146,7 +146,7 @@ def _places(run: Conversion, progress: Progress | None) -> Places:
             return places_of(scans, lidars)
     except NoScanError:
         # Its remedies are for outputs.
-        return Places([], 0, 0, [0] * lidars)
+        return Places([], 0, [0] * lidars)
 
 
 def _motion_windows(scans: Iterable[Scan], poses: Sequence[F64Array]) -> Iterator[MotionWindow]:
