@@ -24,7 +24,7 @@ MOST_PLACES = 20
 # Of a machine at rest.
 _MOST_AT_REST = 3
 # Columns of a window are thinned to about this many points of a lidar.
-_MOST_POINTS = 32_000
+_MOST_POINTS = 65_000
 # A lidar with fewer points in a window is missing from it.
 _FEWEST_POINTS = 500
 # Farther points are too few a square metre, m.
