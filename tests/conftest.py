@@ -101,6 +101,7 @@ SECONDS = (
     "pipeline/test_conversion.py::test_memory",
     "pipeline/test_inspect.py",
     "pipeline/test_passthrough.py::test_memory",
+    "poses/test_from_motion.py",
     "poses/test_point_times.py::test_inspect",
     "poses/test_point_times.py::test_readings",
     "readers/capture/test_fragments.py::test_any_traffic",

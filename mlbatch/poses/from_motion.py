@@ -292,17 +292,17 @@ def _pose(
     words = [
         f"{names[1]}: turn about {_named(way, shift, 'the direction of travel')} known to "
         f"{math.degrees(sigma):.2g} degrees only; {_INSTEAD}"
-        for way, sigma in turns
+        for way, sigma in _told(turns)
     ] + [
         f"{names[1]}: shift along {_named(way, axis, 'the axis of its turns')} known to "
         f"{1000.0 * sigma:.2g} mm only; {_INSTEAD}"
-        for way, sigma in shifts
+        for way, sigma in _told(shifts)
     ]
     words += _late(first, other, middle_ns, names)
     worst = max((sigma for _, sigma in turns), default=0.0)
     refusal = ""
     if worst > _MOST_START_RAD:
-        refusal = words[len(turns) - 1]
+        refusal = words[len(_told(turns)) - 1]
     elif not found.is_unique:
         refusal = f"{names[1]}: the motion fits poses whose axes lie far apart; {_INSTEAD}"
     weak = [np.concatenate([np.zeros(3), way]) for way, _ in turns]
@@ -343,6 +343,11 @@ def _weak(covariance: F64Array, most: float) -> list[tuple[F64Array, float]]:
         for axis, size in zip(axes.T, variance, strict=True)
         if size > most**2
     ]
+
+
+def _told(weak: list[tuple[F64Array, float]]) -> list[tuple[F64Array, float]]:
+    """Directions to name: the worst if all are weak."""
+    return weak[2:] if len(weak) > 2 else weak
 
 
 def _main_axis(vectors: F64Array) -> F64Array:
