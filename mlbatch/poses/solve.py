@@ -19,6 +19,7 @@ from mlbatch.motion.registration import ORIGIN, Pose
 from mlbatch.motion.se3 import exp_rotation, skew
 from mlbatch.poses.stems import Stems, stem_distances, stems
 from mlbatch.poses.surfaces import Distances, Moments, Planes, distances
+from mlbatch.poses.votes import best_move
 
 # Cauchy kernel: residuals of this many standard deviations have half of their weight.
 _KERNEL = 2.5
@@ -101,6 +102,8 @@ class Level:
 
 FINE = Level(0.5, 0.97, 0.15)
 LEVELS = (Level(2.0, 0.9, 1.0, 20_000), Level(1.0, 0.94, 0.4, 40_000), FINE)
+# How often lidars are moved to where stems say.
+_MOST_VOTES = 3
 # Of a search from afar. Few beams give planes in large cells only, ground among plants in small
 # ones only.
 _SEARCH = (
@@ -329,10 +332,35 @@ def find_poses(
     """
     state = guess or State.start(lidars, len(places))
     problem = Problem(places, lidars)
-    *coarse, fine = _SEARCH
+    afar, *coarse, fine = _SEARCH
+    for _ in range(_MOST_VOTES):
+        state = solve(problem, state, afar).state
+        if not _follow_votes(problem, state):
+            break
     for level in coarse:
         state = solve(problem, state, level).state
     return solve(Problem(places, lidars, delays=delays), state, fine)
+
+
+def _follow_votes(problem: Problem, state: State) -> bool:
+    """Move each lidar whose stems meet those of the others elsewhere; whether there was one."""
+    followed = False
+    for lidar in range(1, problem.lidars):
+        sides = []
+        for number, place in enumerate(problem.places):
+            found = zip(place, problem.stems(number, state), strict=True)
+            # A cloud of each lidar is enough.
+            first = {cloud.lidar: stems for cloud, stems in reversed([*found]) if stems is not None}
+            mine = [stems for other, stems in first.items() if other == lidar]
+            sides.append((mine, [stems for other, stems in first.items() if other != lidar]))
+        move, pose = best_move(sides), state.corrections[lidar]
+        if move is not ORIGIN:
+            followed = True
+            state.corrections[lidar] = Pose(
+                np.matmul(move.rotation, pose.rotation),
+                np.matmul(move.rotation, pose.position_m) + move.position_m,
+            )
+    return followed
 
 
 def _is_small(problem: Problem, step: F64Array, factor: float) -> bool:
