@@ -37,7 +37,7 @@ _ROUNDS = 4
 _MOST_ITERATIONS = 25
 _SETTLED = 1e-7
 _MOST_DAMPING = 1e6
-# What errors seem to tell is not known exactly.
+# What errors seem to say is not known exactly.
 _SAFETY = 1.3
 # Of variances: errors of odometry follow the motion. Of simulated drives in a room, a street and a
 # forest, errors were 0.8 to 2.4 times the standard deviations without it.
@@ -105,7 +105,7 @@ def hand_eye(steps: Steps) -> HandEye:
 
 
 def _without_noise(spectrum: _Spectrum, best: _Fit) -> tuple[Pose, F64Array]:
-    """The pose and its covariance without what errors of the first sensor seem to tell.
+    """The pose and its covariance without what errors of the first sensor seem to say.
 
     They count as motion, so that a machine at rest seems to determine a pose, and levers come out
     short (attenuation: W. Fuller, "Measurement Error Models", 1987, section 1.1).
@@ -118,8 +118,8 @@ def _without_noise(spectrum: _Spectrum, best: _Fit) -> tuple[Pose, F64Array]:
     back = np.linalg.inv(root)
     share, axes = np.linalg.eigh(np.matmul(np.matmul(back, by_noise), back.T))
     axes = np.matmul(root, axes)
-    told = np.matmul(axes * np.maximum(0.0, 1.0 - _SAFETY * share), axes.T) + np.diag(_PRIOR)
-    covariance = np.linalg.inv(told)
+    known = np.matmul(axes * np.maximum(0.0, 1.0 - _SAFETY * share), axes.T) + np.diag(_PRIOR)
+    covariance = np.linalg.inv(known)
     # Errors are of both sensors, by shares that are not known: any from none to all is as likely.
     short = np.matmul(covariance[:, :3], np.matmul(by_noise[:3, :3], best.pose.position_m))
     position_m = best.pose.position_m + short[:3] / 2.0

@@ -46,7 +46,7 @@ class Turning:
     rotation: (3, 3), first_from_other; covariance: (7, 7) of its turn in the frame of the first
     sensor, rad, of the bias, rad/s, and of the delay, s; bias: (3,), of the second sensor, its
     frame, rad/s; delay_s: what its stamps are late by (an event has later stamps than in the clock
-    of the first sensor); undetermined: what the motion does not tell of the rotation, in words, or
+    of the first sensor); undetermined: what the motion does not fix of the rotation, in words, or
     ""; late_undetermined: the same of the delay.
     """
 

@@ -100,7 +100,7 @@ def test_a_dry_run_ignores_the_output(shell: Shell) -> None:
 
 
 def test_the_version_and_the_help_go_to_stdout(shell: Shell) -> None:
-    version, help_ = shell("--version"), shell("convert --help")
+    version, help_ = shell("--version"), shell("convert --help-all")
     assert (version.code, version.out) == (0, f"mlbatch {mlbatch.__version__}\n")
     assert (help_.code, help_.err) == (0, "")
     assert "--max-wait" in help_.out

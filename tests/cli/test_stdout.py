@@ -38,8 +38,10 @@ def test_no_other_path_may_be_it(
         words.append(str(CAPTURE))
     if command == "diff":
         words = ["-", str(CAPTURE)] if option == "a" else [str(CAPTURE), "-"]
-    if command == "batch" or (command, option) == ("merge", "parts"):
-        words += ["-o", "out"]
+    if command in ("batch", "extract") or (command, option) == ("merge", "parts"):
+        words += ["-o", "out"] * (option != "--output")
+    if command == "calibrate" and option != "--rig":
+        words += ["--rig", str(RIG)]
     outcome = shell(command, *words)
     assert (outcome.code, outcome.out) == (2, "")
     name = option.upper() if is_argument else option

@@ -164,7 +164,15 @@ def _parse(arguments: list[str]) -> None:
 
 
 # Options of other programs that the pages name.
-FOREIGN_OPTIONS = {"--count", "--decimate", "--help", "--number", "--output-dir", "--seed"} | {
+FOREIGN_OPTIONS = {
+    "--count",
+    "--decimate",
+    "--help",
+    "--help-all",
+    "--number",
+    "--output-dir",
+    "--seed",
+} | {
     "--target",
     "--version",
     "--install-completion",
