@@ -1,7 +1,7 @@
 """Times of decoded clouds as `inspect` checks them: sweeps of the first seconds, and the verdicts.
 
-The check itself is `poses.point_times`; here are the clouds that it needs, and how its figures are
-hint: which key of the rig would read the times as they fit.
+The check itself is `poses.point_times`; here are the clouds that it needs, and its figures in
+words, with the key of the rig that would read the times as they fit.
 """
 
 from __future__ import annotations

@@ -43,7 +43,9 @@ def test_a_rig_and_a_page(shell: Shell) -> None:
     assert (outcome.code, outcome.err) == (0, "")
     lines = outcome.out.splitlines()
     assert lines[1].split("  ")[0] == "lidar"
-    assert lines[2].split()[:7] == "left 0.1000, 0.3000, 0.6000 0.000, 10.000, 80.000".split()
+    assert lines[2].split()[:7] == [
+        *("left", "0.1000,", "0.3000,", "0.6000", "0.000,", "10.000,", "80.000")
+    ]
     assert lines[-2:] == ["wrote rig.yaml", "wrote page.html"]
     found, true = (read_rig(Path(path)).sensors[1].extrinsics for path in ("rig.yaml", TRUE))
     assert isinstance(found, np.ndarray)
