@@ -17,7 +17,7 @@ import numpy as np
 from mlbatch.arrays import F64Array, I64Array
 from mlbatch.motion.estimate import VelocityEstimator
 from mlbatch.motion.registration import ORIGIN, Cloud, Pose
-from mlbatch.motion.se3 import exp_rotation, exp_transform, rotated
+from mlbatch.motion.se3 import exp_rotation, exp_transform, log_rotation, rotated
 from mlbatch.poses.hand_eye import Steps, hand_eye, known_rows
 from mlbatch.poses.surfaces import planes
 from mlbatch.poses.turning import lidar_turns, turning
@@ -43,6 +43,8 @@ _MOST_SIGMA_M = 0.007
 _MOST_SIGMA_RAD = math.radians(0.035)
 # And of a start that surfaces in common can refine, of which a guess may be 1 m and 20 degrees off.
 _MOST_START_RAD = math.radians(6.0)
+# Beyond, a pose is another one: of chi-squared with six degrees of freedom one in 10^6.
+_MOST_SQUARE = 38.0
 # Between two clocks.
 _MOST_LATE_S = 0.015
 _ALONG = math.cos(math.radians(25.0))
@@ -151,6 +153,30 @@ def poses_of_twists(twist: F64Array, middle_ns: I64Array, names: Sequence[str]) 
         for own, name in zip(twist[1:], names[1:], strict=True)
     )
     return MotionPoses((first, *others), steps, middle_ns, twist)
+
+
+def contradiction(motion: MotionPoses, poses: Sequence[Pose], names: Sequence[str]) -> str:
+    """Why refined poses first_from_lidar are wrong, if the motion proves it, or "".
+
+    Surfaces that look alike match in places that are wrong; what a lidar measures of its own motion
+    does not depend on the others.
+    """
+    rows = zip(motion.poses[1:], poses[1:], names[1:], strict=True)
+    for found, refined, name in rows:
+        if found.refusal:
+            continue
+        shift_m = refined.position_m - found.first_from_lidar.position_m
+        turn = np.matmul(refined.rotation, found.first_from_lidar.rotation.T)
+        turn_rad = log_rotation(turn[None])[0]
+        error = np.concatenate([shift_m, turn_rad])
+        if float(np.dot(error, np.linalg.solve(found.covariance, error))) > _MOST_SQUARE:
+            return (
+                f"{name}: expected surfaces and motion that agree, found poses "
+                f"{1000.0 * float(np.linalg.norm(shift_m)):.0f} mm and "
+                f"{math.degrees(float(np.linalg.norm(turn_rad))):.2f} degrees apart, more than "
+                f"their standard deviations explain; {_INSTEAD}"
+            )
+    return ""
 
 
 class Odometry:
@@ -292,17 +318,17 @@ def _pose(
     words = [
         f"{names[1]}: turn about {_named(way, shift, 'the direction of travel')} known to "
         f"{math.degrees(sigma):.2g} degrees only; {_INSTEAD}"
-        for way, sigma in _told(turns)
+        for way, sigma in _named_directions(turns)
     ] + [
         f"{names[1]}: shift along {_named(way, axis, 'the axis of its turns')} known to "
         f"{1000.0 * sigma:.2g} mm only; {_INSTEAD}"
-        for way, sigma in _told(shifts)
+        for way, sigma in _named_directions(shifts)
     ]
     words += _late(first, other, middle_ns, names)
     worst = max((sigma for _, sigma in turns), default=0.0)
     refusal = ""
     if worst > _MOST_START_RAD:
-        refusal = words[len(_told(turns)) - 1]
+        refusal = words[len(_named_directions(turns)) - 1]
     elif not found.is_unique:
         refusal = f"{names[1]}: the motion fits poses whose axes lie far apart; {_INSTEAD}"
     weak = [np.concatenate([np.zeros(3), way]) for way, _ in turns]
@@ -345,7 +371,7 @@ def _weak(covariance: F64Array, most: float) -> list[tuple[F64Array, float]]:
     ]
 
 
-def _told(weak: list[tuple[F64Array, float]]) -> list[tuple[F64Array, float]]:
+def _named_directions(weak: list[tuple[F64Array, float]]) -> list[tuple[F64Array, float]]:
     """Directions to name: the worst if all are weak."""
     return weak[2:] if len(weak) > 2 else weak
 

@@ -40,8 +40,8 @@ _MOST_DAMPING = 1e6
 # What errors seem to say is not known exactly.
 _SAFETY = 1.3
 # Of variances: errors of odometry follow the motion. Of simulated drives in a room, a street and a
-# forest, errors were 0.8 to 2.4 times the standard deviations without it.
-_DOUBT = 3.0
+# forest, they were 0.4 to 2.4 times the standard deviations without it.
+DOUBT = 3.0
 # What is known before any motion: of shifts from the first sensor, m; of turns nothing, rad.
 _PRIOR = np.array([3.0] * 3 + [3.0] * 3) ** -2
 # Fits that leave this much more, in variances, are another answer; others nearer to it are the
@@ -123,7 +123,7 @@ def _without_noise(spectrum: _Spectrum, best: _Fit) -> tuple[Pose, F64Array]:
     # Errors are of both sensors, by shares that are not known: any from none to all is as likely.
     short = np.matmul(covariance[:, :3], np.matmul(by_noise[:3, :3], best.pose.position_m))
     position_m = best.pose.position_m + short[:3] / 2.0
-    covariance = _DOUBT * (covariance + np.outer(short, short) / 12.0)
+    covariance = DOUBT * (covariance + np.outer(short, short) / 12.0)
     return Pose(best.pose.rotation, position_m), covariance
 
 

@@ -15,7 +15,7 @@ import numpy as np
 from mlbatch.arrays import F64Array, I64Array
 from mlbatch.motion.agreement import Turns
 from mlbatch.motion.se3 import exp_rotation, skew
-from mlbatch.poses.hand_eye import Noise, known_rows, transformed
+from mlbatch.poses.hand_eye import DOUBT, Noise, known_rows, transformed
 from mlbatch.units import NS_PER_MS, NS_PER_S
 
 _LEAST_STEPS = 30
@@ -93,7 +93,8 @@ def turning(seen: F64Array, middle_ns: I64Array, turns: Turns, name: str) -> Tur
         fit.weigh(state)
         for _ in range(_ITERATIONS):
             state = fit.after(state)
-    covariance = np.asarray(np.linalg.inv(fit.normal(state)), np.float64) + np.diag(_ADDED)
+    inverse = np.asarray(np.linalg.inv(fit.normal(state)), np.float64)
+    covariance = DOUBT * inverse + np.diag(_ADDED)
     return Turning(*state, covariance, *_words(fit, state, covariance, name))
 
 

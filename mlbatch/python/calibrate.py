@@ -28,7 +28,7 @@ from mlbatch.poses.calibration import (
     numbers,
     rounded,
 )
-from mlbatch.poses.from_motion import MotionWindow, SensorCloud, poses_from_motion
+from mlbatch.poses.from_motion import MotionWindow, SensorCloud, contradiction, poses_from_motion
 from mlbatch.poses.places import LEAST_RANGE_M, MOST_RANGE_M, Places, places_of
 from mlbatch.poses.solve import State
 from mlbatch.python.options import Moment, Names, Paths, session_job, window_job
@@ -119,12 +119,12 @@ def calibrate(
     moved = motion_poses(poses[0], motion)
     guess = State.start(len(names), 0)
     guess.corrections = [
-        Pose(found[:3, :3], found[:3, 3])
-        for found in (compose(new, inverse(old)) for new, old in zip(moved, poses, strict=True))
+        Pose(change[:3, :3], change[:3, 3])
+        for change in (compose(new, inverse(old)) for new, old in zip(moved, poses, strict=True))
     ]
     places = _places(Conversion(job), progress)
     try:
-        return calibrated(places, names, poses, delays=time_offset, guess=guess)
+        found = calibrated(places, names, poses, delays=time_offset, guess=guess)
     except Undetermined as err:
         if time_offset:
             raise
@@ -136,6 +136,11 @@ def calibrate(
                 f"neither: {'; '.join(word for word, _, _ in words)}; {words[-1][2]}"
             ) from err
         return by_motion(names, moved, motion, places.windows)
+    back = inverse(found.lidars[0].body_from_sensor)
+    refined = [compose(back, lidar.body_from_sensor) for lidar in found.lidars]
+    if wrong := contradiction(motion, [Pose(own[:3, :3], own[:3, 3]) for own in refined], names):
+        raise RecordingError(f"calibrate: {wrong}")
+    return found
 
 
 def _places(run: Conversion, progress: Progress | None) -> Places:

@@ -10,7 +10,13 @@ import pytest
 from mlbatch.arrays import F64Array, I64Array
 from mlbatch.motion.registration import Pose
 from mlbatch.motion.se3 import exp_rotation, log_rotation
-from mlbatch.poses.from_motion import MotionPose, Odometry, SensorCloud, poses_of_twists
+from mlbatch.poses.from_motion import (
+    MotionPose,
+    Odometry,
+    SensorCloud,
+    contradiction,
+    poses_of_twists,
+)
 
 STEPS = 200
 NS = 100_000_000
@@ -130,6 +136,25 @@ def test_clocks_that_differ_are_named(late_s: float) -> None:
     (_, found) = poses_of_twists(twists, middles(), ("front", "rear")).poses
     (words,) = [words for words in found.undetermined if "clock of front" in words]
     assert "60 ms after" in words if late_s > 0 else "60 ms before" in words
+
+
+def test_refined_poses_that_contradict_the_motion() -> None:
+    first, other = mountings(6)
+    body = body_twists("planar")
+    twists = np.stack([noisy(seen_by(body, first), 1), noisy(seen_by(body, other), 2)])
+    motion = poses_of_twists(twists, middles(), ("front", "rear"))
+    true = Pose(
+        first.rotation.T @ other.rotation,
+        first.rotation.T @ (other.position_m - first.position_m),
+    )
+    start = Pose(np.eye(3), np.zeros(3))
+    assert not contradiction(motion, [start, true], ("front", "rear"))
+    ahead, up = first.rotation.T[:, 0], first.rotation.T[:, 2]
+    # Of a shift along the axis of its turns the motion says little.
+    shifted = Pose(true.rotation, true.position_m + 0.05 * up)
+    assert not contradiction(motion, [start, shifted], ("front", "rear"))
+    shifted = Pose(true.rotation, true.position_m + 0.05 * ahead)
+    assert "rear: expected surfaces" in contradiction(motion, [start, shifted], ("front", "rear"))
 
 
 def test_a_machine_that_stands_is_refused() -> None:
