@@ -58,6 +58,7 @@ LONG = (
     "motion/test_wall.py",
     "outputs/test_read.py",
     "page/test_browser.py",
+    "page/test_view.py",
     "page/test_comparison.py::test_it_is_drawn_in_a_browser",
     "page/test_windows.py::test_long_runs",
     "pipeline/test_resume.py",

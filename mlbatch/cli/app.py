@@ -18,7 +18,7 @@ _PATH_TYPES = ("path", "file", "directory")
 # Modules of this package, each with a function of the same name, in the order of `--help`.
 COMMANDS = (
     *("convert", "merge", "batch", "batch-status", "inspect", "compare", "sensors", "verify"),
-    *("report", "calibrate", "digest", "diff", "extract", "simulate", "schema"),
+    *("report", "view", "calibrate", "digest", "diff", "extract", "simulate", "schema"),
 )
 
 
@@ -74,7 +74,7 @@ class Command(TyperCommand):
                     f"{name}: expected a path, found -: neither standard input "
                     "nor standard output can be used here; give a file or folder"
                 )
-        if self.name != "convert":
+        if self.name not in ("convert", "view"):
             return super().invoke(ctx)
         places = rig_options.take(ctx, self.params)
         try:

@@ -1,4 +1,7 @@
-"""Options of `mlbatch convert` that the rig file keeps; the command line overrides them."""
+"""Options of `mlbatch convert` that the rig file keeps; the command line overrides them.
+
+Those that another command does not have are left out.
+"""
 
 from __future__ import annotations
 
@@ -22,7 +25,9 @@ def take(context: Any, params: Sequence[Any]) -> Mapping[str, str]:
     by_key = {str(param.name).rstrip("_"): param for param in params}
     places = {}
     for option in read_rig(rig).options:
-        param = by_key[option.name]
+        param = by_key.get(option.name)
+        if param is None:
+            continue
         if context.get_parameter_source(param.name).name != "DEFAULT":
             continue
         value = list(option.values) if param.multiple else option.values[0]

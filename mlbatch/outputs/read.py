@@ -48,11 +48,12 @@ _KINDS = {
 }
 
 
-def read(path: Path) -> Iterator[Scan]:
+def read(path: Path, *, by_window: bool = False) -> Iterator[Scan]:
     """Yield the scans of an output in its order, with `--split` those of each sensor.
 
-    path: a .mcap or .bag file, a folder (files of scans, ROS 2 bag), or one file of a scan. Raises
-    RecordingError where the output is damaged, unfinished or of another program.
+    path: a .mcap or .bag file, a folder (files of scans, ROS 2 bag), or one file of a scan;
+    by_window: by time also where sensors have folders. Raises RecordingError where the output is
+    damaged, unfinished or of another program.
     """
     if path.name.endswith(_PARTIAL):
         raise RecordingError(
@@ -71,7 +72,10 @@ def read(path: Path) -> Iterator[Scan]:
         bag, _ = open_bag(log, path)
         yield from _scans_of_mcaps(log, path, {f"{path.name}/{file.name}": file for file in bag})
     elif kind.form is not None:
-        yield from _scans_of_files(path, kind.form, scan_files(log, path, kind.form.suffix), log)
+        files = scan_files(log, path, kind.form.suffix)
+        if by_window:
+            files.sort(key=lambda file: (file.index, file.slice or 0))
+        yield from _scans_of_files(path, kind.form, files, log)
     else:
         yield from _scans_of_file(path, kind.found)
 

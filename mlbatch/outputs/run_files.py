@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from mlbatch.bounded import MOST_TABLE_BYTES, read_text
+from mlbatch.bounded import MOST_TABLE_BYTES, open_file, read_text
 from mlbatch.outputs.damage import CheckLog, VerifyError
 from mlbatch.outputs.folders import entries
-from mlbatch.outputs.kinds import kind_of
+from mlbatch.outputs.kinds import format_of, kind_of
 
 if TYPE_CHECKING:
     from mlbatch.outputs.mcap_file import McapFile
@@ -18,6 +19,9 @@ REPORT = "report.json"
 TABLE = "scans.csv"
 # In mlbatch.grid of each of several files; their report and table are in the folder.
 PIECES = "windows_per_file"
+# In the header of an MCAP file: the version, which simulated and extracted recordings do not have.
+_LIBRARY = re.compile(rb"mlbatch \d")
+_HEAD_BYTES = 64
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,6 +69,20 @@ class RunFiles:
                 report = inner[0] if report is None else report
                 table = inner[1] if table is None else table
         return report, table
+
+
+def is_output(path: Path) -> bool:
+    """Whether a path is an output of `convert`, by its first bytes, its report or its files."""
+    if not path.exists():
+        return False
+    kind = kind_of(path)
+    if kind.name == "rosbag1":
+        return RunFiles.of(path).report.exists()
+    mcaps = mcaps_of(path)
+    if mcaps:
+        with open_file(mcaps[0]) as file:
+            return _LIBRARY.search(file.read(_HEAD_BYTES)) is not None
+    return kind.form is not None or format_of([path]) is not None
 
 
 def mcaps_of(output: Path) -> list[Path]:

@@ -6,8 +6,6 @@ A content security policy allows the page's own script and no request.
 from __future__ import annotations
 
 import base64
-import hashlib
-import json
 import math
 import re
 from collections.abc import Sequence
@@ -24,7 +22,7 @@ from mlbatch.page.clouds import chosen_clouds
 from mlbatch.page.findings import Finding, Level, findings, number, percent, verdict
 from mlbatch.page.points import PageCloud
 from mlbatch.page.source import Source
-from mlbatch.page.templates import Verdict, asset, render
+from mlbatch.page.templates import Verdict, asset, page_json, render
 from mlbatch.page.windows import Windows, read_windows, summarise
 from mlbatch.page.words import COSTS, MEANINGS, SERVICES
 from mlbatch.report.report import RunReport, SensorReport, Unassigned
@@ -53,7 +51,7 @@ _FLAT_POINTS = 0.02  # of the largest
 # Between two scans that are played.
 _PLAY_MS = (100, 500)
 # Colours of points: key of the plots, name.
-_COLOURS = {"lidar": "lidar", "height": "height", "time": "time", "bright": "intensity"}
+COLOURS = {"lidar": "lidar", "height": "height", "time": "time", "bright": "intensity"}
 _NO_SCANS = "The scans are not available to this page: give the output itself."
 
 
@@ -63,7 +61,6 @@ def page_text(source: Source) -> str:
     windows = None if source.table is None else read_windows(source.table, report.slices)
     clouds, why_no_clouds = _clouds(source, windows)
     found = findings(report, windows)
-    script = asset("viewer.js") + asset("page.js")
     lacking = {
         "lidar": not all(cloud.has_lidar for cloud in clouds),
         "time": not all(cloud.has_time for cloud in clouds),
@@ -73,9 +70,8 @@ def page_text(source: Source) -> str:
         "run.html",
         version=report.version,
         title=_title(source),
-        digest=base64.b64encode(hashlib.sha256(script.encode()).digest()).decode(),
-        script=script,
-        data=_json(_plot_data(report, windows, clouds)),
+        script="".join(map(asset, ("viewer.js", "player.js", "page.js"))),
+        data=page_json(_plot_data(report, windows, clouds)),
         report=report,
         verdict=_verdict(report, found, windows),
         cards=_cards(report),
@@ -84,7 +80,7 @@ def page_text(source: Source) -> str:
         clouds=clouds,
         about_clouds=_about_clouds(clouds, windows),
         why_no_clouds=why_no_clouds,
-        colours=_COLOURS,
+        colours=COLOURS,
         lacking=[name for name, is_absent in lacking.items() if is_absent],
         accounts=_accounts(report),
         clocks=[_clock(sensor, report.recorded_s) for sensor in report.sensors],
@@ -94,14 +90,6 @@ def page_text(source: Source) -> str:
         topics=[(one.topic, f"{one.read:,}", f"{one.written:,}") for one in report.messages],
         costs=_costs(report),
     )
-
-
-def _json(value: object) -> str:
-    """JSON that cannot end its script element."""
-    text = json.dumps(value, ensure_ascii=False, allow_nan=False, separators=(",", ":"))
-    for character in "<>&\u2028\u2029":
-        text = text.replace(character, f"\\u{ord(character):04x}")
-    return text
 
 
 def _title(source: Source) -> str:
@@ -405,20 +393,26 @@ def _plot_data(
     if windows is None:
         return data
     data["windows"] = _window_data(windows)
-    data["clouds"] = [_cloud_data(one, windows) for one in clouds]
+    data["clouds"] = [
+        cloud_data(one, windows.seconds(one.place.row))
+        | {"data": base64.b64encode(one.packed).decode()}
+        for one in clouds
+    ]
     between_ms = np.diff([one.place.start_ns for one in clouds]) / NS_PER_MS
     apart_ms = float(np.median(between_ms)) if len(between_ms) else 0.0
     # The head of a run, before its first whole window, is chosen by hand.
+    data["ahead"] = 1
     data["begin"] = next((i for i, one in enumerate(clouds) if "first" in one.place.title), 0)
     data["play_ms"] = min(max(_PLAY_MS[0], apart_ms), _PLAY_MS[1])
     return data
 
 
-def _cloud_data(cloud: PageCloud, windows: Windows) -> dict[str, Any]:
+def cloud_data(cloud: PageCloud, after_s: float) -> dict[str, Any]:
+    """A scan for viewer.js without its points; after_s: its start after the first scan."""
     place = cloud.place
     sliced = f" slice {place.slice}" if place.slice else ""
     return {
-        "title": f"Scan {place.index}{sliced}, +{windows.seconds(place.row):.1f} s",
+        "title": f"Scan {place.index}{sliced}, +{after_s:.1f} s",
         "text": _caption(cloud),
         "shown": cloud.shown,
         "low": cloud.low_m,
@@ -428,7 +422,6 @@ def _cloud_data(cloud: PageCloud, windows: Windows) -> dict[str, Any]:
         "view": cloud.view_m,
         "times": cloud.times_ms,
         "has": {"lidar": cloud.has_lidar, "time": cloud.has_time, "ring": cloud.has_ring},
-        "data": base64.b64encode(cloud.packed).decode(),
     }
 
 

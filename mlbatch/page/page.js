@@ -316,122 +316,9 @@
   // -- scans ------------------------------------------------------------------------------------
 
   const clouds = data.clouds;
-  let chosen = 0, colouring = "height", playing = null;
-  const unpackings = new Map();
-
-  // The points of a scan; a few of them stay unpacked.
-  function pointsOf(number) {
-    if (!unpackings.has(number)) {
-      unpackings.set(number, unpackCloud(clouds[number]));
-      if (unpackings.size > 12) unpackings.delete(unpackings.keys().next().value);
-    }
-    return unpackings.get(number);
-  }
-
-  function drawLegend(cloud) {
-    const legend = byId("legend");
-    legend.textContent = "";
-    const item = (text, background) => {
-      const span = document.createElement("span");
-      const mark = document.createElement("i");
-      mark.style.background = background;
-      if (background.startsWith("linear")) mark.style.width = "90px";
-      span.append(mark, text);
-      legend.append(span);
-    };
-    const ramp = "linear-gradient(90deg," +
-      SCALE.map((c) => "rgb(" + c.join(",") + ")").join(",") + ")";
-    if (colouring === "lidar") data.sensors.forEach((name, i) => item(name, sensorColor(i)));
-    else if (colouring === "height") {
-      // Plus zero: no sign of a rounded zero.
-      const [low, high] = cloud.height.map((one) => (Math.round(one * 10) / 10 + 0).toFixed(1));
-      item("height " + low + " to " + high + " m", ramp);
-    } else if (colouring === "time") {
-      const [low, high] = cloud.times.map((one) => one.toFixed(0));
-      item("time " + low + " to " + high + " ms", ramp);
-    } else item("intensity, 2 % to 98 % of the points", ramp);
-  }
-
-  function startClouds() {
-    if (!clouds.length) return;
-    const canvas = byId("cloud"), slider = byId("scan"), play = byId("play");
-    const why = byId("cloudwhy");
-    const say = (text) => { why.textContent = text; why.hidden = false; };
-    if (typeof DecompressionStream === "undefined") {
-      say("This browser cannot unpack the points (no DecompressionStream): Chrome 103, " +
-        "Firefox 113, Safari 16.4 and later can.");
-      byId("stage").hidden = true;
-      return;
-    }
-    const viewer = makeViewer(canvas, data.sensors, data.poses, say);
-    const isFree = (colour) => !document.querySelector("[data-colour=" + colour + "]").disabled;
-    if (data.sensors.length > 1 && isFree("lidar")) colouring = "lidar";
-    const show = async (number) => {
-      chosen = number;
-      const cloud = await pointsOf(number);
-      if (chosen !== number) return;
-      viewer.show(cloud, colouring);
-      slider.value = number;
-      slider.setAttribute("aria-valuetext", cloud.title);
-      byId("cloudinfo").textContent = cloud.title + ": " + cloud.text;
-      drawLegend(cloud);
-      document.querySelectorAll("[data-colour]").forEach((button) => {
-        button.setAttribute("aria-pressed", button.dataset.colour === colouring);
-      });
-      document.querySelectorAll("[data-scan]").forEach((button) => {
-        button.setAttribute("aria-pressed", Number(button.dataset.scan) === number);
-      });
-      document.documentElement.dataset.shown = number;
-    };
-    const stop = () => {
-      clearTimeout(playing);
-      playing = null;
-      play.textContent = "Play";
-    };
-    const step = async () => {
-      await show((chosen + 1) % clouds.length);
-      if (playing === null) return;
-      pointsOf((chosen + 1) % clouds.length);
-      playing = setTimeout(step, data.play_ms);
-    };
-    const toggle = () => {
-      if (playing !== null) { stop(); return; }
-      play.textContent = "Pause";
-      playing = setTimeout(step, 0);
-    };
-    const choose = (number) => {
-      stop();
-      show(Math.max(0, Math.min(clouds.length - 1, number)));
-    };
-    const colour = (name) => { colouring = name; show(chosen); };
-    document.querySelectorAll("[data-colour]").forEach((button) => {
-      button.addEventListener("click", () => colour(button.dataset.colour));
-    });
-    document.querySelectorAll("[data-scan]").forEach((button) => {
-      button.addEventListener("click", () => choose(Number(button.dataset.scan)));
-    });
-    slider.addEventListener("input", () => choose(Number(slider.value)));
-    play.addEventListener("click", toggle);
-    byId("fit").addEventListener("click", viewer.fit);
-    byId("above").addEventListener("click", viewer.above);
-    byId("full").addEventListener("click", () => {
-      if (document.fullscreenElement) document.exitFullscreen();
-      else byId("viewer").requestFullscreen();
-    });
-    canvas.addEventListener("keydown", (event) => {
-      if (event.ctrlKey || event.altKey || event.metaKey) return;
-      if (event.key === " ") toggle();
-      else if (event.key === "." || event.key === ",") choose(chosen + (event.key === "." ? 1 : -1));
-      else if (event.key === "c") {
-        const names = [...document.querySelectorAll("[data-colour]:enabled")]
-          .map((button) => button.dataset.colour);
-        colour(names[(names.indexOf(colouring) + 1) % names.length]);
-      } else return;
-      event.preventDefault();
-    });
-    new ResizeObserver(viewer.draw).observe(canvas);
-    redraws.push(viewer.draw);
-    show(data.begin);
+  if (clouds.length) {
+    redraws.push(startPlayer(data, (number) =>
+      number < clouds.length ? unpackCloud(clouds[number]) : null, () => clouds.length - 1));
   }
 
   // -- start ------------------------------------------------------------------------------------
@@ -466,7 +353,6 @@
     byId("on").addEventListener("click", () => move(.5));
     byId("all").addEventListener("click", () => setView(0, total));
   }
-  startClouds();
   const drawAll = () => {
     drawnWidth = document.body.clientWidth;
     redraws.forEach((draw) => draw());

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import base64
+import hashlib
+import json
 from dataclasses import dataclass
 from functools import cache
 from importlib import resources
@@ -34,6 +37,14 @@ def asset(name: str) -> str:
     return resources.files("mlbatch.page").joinpath(name).read_text(encoding="utf-8")
 
 
+def page_json(value: object) -> str:
+    """JSON that cannot end its script element."""
+    text = json.dumps(value, ensure_ascii=False, allow_nan=False, separators=(",", ":"))
+    for character in "<>&\u2028\u2029":
+        text = text.replace(character, f"\\u{ord(character):04x}")
+    return text
+
+
 @cache
 def _environment() -> Environment:
     # Imported on demand: most runs write no page.
@@ -48,5 +59,11 @@ def _environment() -> Environment:
         keep_trailing_newline=True,
     )
     found.filters["tenth"] = "{:.1f}".format
+    found.filters["digest"] = _digest
     found.globals["asset"] = asset
     return found
+
+
+def _digest(script: str) -> str:
+    """SHA-256 of a script for the content security policy, base64."""
+    return base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()

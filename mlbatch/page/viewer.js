@@ -42,9 +42,10 @@ function bytesOf(base64) {
   return bytes;
 }
 
-// A scan with its points, from the planes that points.py has packed.
+// A scan with its points, from the planes that points.py has packed; data: bytes, or base64.
 async function unpackCloud(packed) {
-  const stream = new Blob([bytesOf(packed.data)]).stream()
+  const deflated = typeof packed.data === "string" ? bytesOf(packed.data) : packed.data;
+  const stream = new Blob([deflated]).stream()
     .pipeThrough(new DecompressionStream("deflate-raw"));
   const bytes = new Uint8Array(await new Response(stream).arrayBuffer());
   const count = packed.shown;

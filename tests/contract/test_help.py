@@ -39,6 +39,10 @@ OPTIONS: dict[str, set[str]] = {
         "sensors": "json",
         "verify": "report json verbose",
         "report": "output report html-scans overwrite",
+        "view": """
+            rig metadata identity-extrinsics rate deskew start end only include-sensor
+            ignore exclude-sensor min-range exclude-box clock align-clocks port no-browser
+        """,
         "extract": """
             output rig metadata only ignore start end duration pass overwrite quiet verbose
         """,

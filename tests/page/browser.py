@@ -79,8 +79,8 @@ class Browser:
         elif method == "Network.requestWillBeSent":
             self.requests.append(params["request"]["url"])
 
-    def open(self, path: Path, *, width: int = 1400, dark: bool = False) -> None:
-        """Load a page and wait until it is drawn."""
+    def open(self, page: Path | str, *, width: int = 1400, dark: bool = False) -> None:
+        """Load a page, by its file or address, and wait until it is drawn."""
         self.errors.clear()
         self.requests.clear()
         scheme = {"name": "prefers-color-scheme", "value": "dark" if dark else "light"}
@@ -90,7 +90,7 @@ class Browser:
             "Emulation.setDeviceMetricsOverride",
             **{"width": width, "height": 900, "deviceScaleFactor": 1, "mobile": False},
         )
-        self.call("Page.navigate", url=path.resolve().as_uri())
+        self.call("Page.navigate", url=page if isinstance(page, str) else page.resolve().as_uri())
         until = time.monotonic() + _LONGEST_S
         while not self.run(
             "document.readyState === 'complete' && 'drawn' in document.documentElement.dataset"

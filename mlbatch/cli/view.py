@@ -1,0 +1,116 @@
+"""`mlbatch view`: scans in the browser, from a server on this machine."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import sys
+import threading
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from mlbatch import options
+from mlbatch.cli.parameters import parameter, with_parameters
+from mlbatch.errors import UsageError, one_line
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+
+    from mlbatch.outputs.scan import Scan
+
+# Of `convert`: what selects lidars, times and points.
+OPTIONS = (
+    *("rig", "metadata", "identity_extrinsics", "rate", "deskew", "start", "end"),
+    *("only", "ignore", "min_range", "exclude_box", "clock", "align_clocks"),
+)
+
+
+def view(
+    sources: Annotated[
+        list[Path],
+        typer.Argument(
+            help="Output of convert, or recordings of one session, converted while they are shown.",
+            metavar="OUTPUT|RECORDING...",
+        ),
+    ],
+    port: Annotated[
+        int, typer.Option(help="Port of the page.  [default: a free one]", show_default=False)
+    ] = 0,
+    no_browser: Annotated[
+        bool, typer.Option("--no-browser", help="Open no browser, print the address alone.")
+    ] = False,
+    **values: Any,
+) -> None:
+    """Show the scans of an output or a recording in the browser, on this machine alone."""
+    from mlbatch.page.view_scans import ViewScans
+    from mlbatch.page.view_server import ViewServer
+    from mlbatch.pipeline.interrupts import interruptible
+
+    begin, total = _source(sources, values)
+    title = ", ".join(path.name or str(path) for path in sources)
+    with interruptible():
+        scans = ViewScans(begin, _print_error)
+        try:
+            with ViewServer(title, scans, total, port) as server:
+                typer.echo(f"{server.url} shows {one_line(title)}; Ctrl-C ends")
+                sys.stdout.flush()
+                if not no_browser and _has_screen():
+                    import webbrowser
+
+                    # Some browsers return when they end.
+                    threading.Thread(target=webbrowser.open, args=[server.url], daemon=True).start()
+                # Ctrl-C is the usual end.
+                with contextlib.suppress(KeyboardInterrupt):
+                    server.serve_forever()
+        finally:
+            scans.close()
+    if scans.error:
+        raise typer.Exit(1)
+
+
+with_parameters(view, (parameter(options.BY_NAME[name]) for name in OPTIONS))
+
+
+def _source(
+    paths: list[Path], values: dict[str, Any]
+) -> tuple[Callable[[], Iterator[Scan]], int | None]:
+    """What begins to give scans, and their number if it is known."""
+    from mlbatch.outputs.read import read
+    from mlbatch.outputs.run_files import RunFiles, is_output
+
+    if len(paths) == 1 and is_output(paths[0]):
+        for name in OPTIONS:
+            if (values[name] or None) not in (None, options.BY_NAME[name].default):
+                raise UsageError(
+                    f"{options.BY_NAME[name].long}: expected with recordings alone, found the "
+                    f"output {paths[0]}, which is shown as it is; leave it out"
+                )
+        table = RunFiles.of(paths[0]).texts()[1]
+        return lambda: read(paths[0], by_window=True), None if table is None else _windows_of(table)
+    from mlbatch.cli.values import job_of
+    from mlbatch.python.recording import scans_of
+
+    defaults = {option.name: option.default for option in options.CONVERT}
+    given = {"pass_": None, "no_pose_check": True} | values
+    job = job_of(paths, defaults | given)
+    return lambda: scans_of(job), None
+
+
+def _windows_of(table: str) -> int:
+    """Number of windows in scans.csv."""
+    import numpy as np
+
+    from mlbatch.outputs.table import read_table
+
+    return len(np.unique(read_table(table, "scans.csv")["start_ns"]))
+
+
+def _has_screen() -> bool:
+    """False where only a browser in the terminal could be opened."""
+    return sys.platform != "linux" or any(map(os.environ.get, ("DISPLAY", "WAYLAND_DISPLAY")))
+
+
+def _print_error(text: str) -> None:
+    typer.echo(f"mlbatch: error: {one_line(text)}", err=True)
