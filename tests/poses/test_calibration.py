@@ -36,7 +36,6 @@ _NO_AXES = np.zeros((6, 0))
 GUESSES = {
     "20 degrees about z, 1 m": ([0.8, 0.6, 0.0], [0.0, 0.0, 20.0]),
     "12 degrees about x, 0.6 m": ([0.0, -0.36, 0.48], [12.0, 0.0, 0.0]),
-    "8 degrees about y": ([0.0, 0.0, 0.0], [0.0, -8.0, 0.0]),
     "true": ([0.0, 0.0, 0.0], [0.0, 0.0, 0.0]),
 }
 
@@ -137,12 +136,11 @@ UNDETERMINED = {
 
 
 @pytest.mark.parametrize("name", UNDETERMINED)
-@pytest.mark.parametrize("turn_deg", [0, 5])
-def test_what_a_scene_does_not_fix_is_refused(tmp_path: Path, name: str, turn_deg: int) -> None:
+def test_what_a_scene_does_not_fix_is_refused(tmp_path: Path, name: str) -> None:
     scene, sensors, reason = UNDETERMINED[name]
     text = scenario_text(sensors, scene=scene, motion=_STRAIGHT, duration=1.5)
     drive = record(tmp_path, text)
-    guess = guessed(drive.rig, tmp_path / "guess.yaml", [0.1, 0.1, 0.1], [0, 0, turn_deg])
+    guess = guessed(drive.rig, tmp_path / "guess.yaml", [0.1, 0.1, 0.1], [0, 0, 5])
     with pytest.raises(RecordingError, match="calibrate: expected ") as refused:
         mlbatch.calibrate(drive.path, guess, tmp_path / "rig.yaml")
     assert reason in str(refused.value)
