@@ -118,8 +118,9 @@ class PoseCheck:
             )
             time_s = (stamp_ns - last.start_ns) / NS_PER_S
             for number, origin_m in enumerate(self._origins_m):
-                range_m = np.linalg.norm(points_m - origin_m, axis=1)
-                rows = (lidar == number) & (range_m > _NEAREST_M) & (range_m < _FARTHEST_M)
+                own = np.flatnonzero(lidar == number)
+                squared = ((points_m[own] - origin_m) ** 2).sum(axis=1)
+                rows = own[(squared > _NEAREST_M**2) & (squared < _FARTHEST_M**2)]
                 clouds.append(Cloud(number, points_m[rows], time_s[rows], origin_m))
         self._comparison.add(clouds)
         self._is_over = self._comparison.is_settled

@@ -54,6 +54,8 @@ _ENOUGH = 3
 # Points of a cloud that are used, and where few surfaces are matched, all.
 _POINTS = 11_000
 _FEW_SURFACES = 40
+# Directions that planes do not determine, from which on stems are looked for.
+_WEAK = 2
 # Surfaces in common below which nothing is said, and the share of them that fits with good poses.
 _LEAST_SURFACES = 12
 _MISFIT = 0.5
@@ -171,7 +173,7 @@ class PoseComparison:
         self.places += 1
         few = [self._reduced(cloud) for cloud in place]
         problem, solution = self._solved(few)
-        if solution.weak.shape[1] and not self._needs_stems:
+        if solution.weak.shape[1] >= _WEAK and not self._needs_stems:
             self._needs_stems = True
             problem, solution = self._solved([self._reduced(cloud) for cloud in place])
         misfit = self._count(problem.first)

@@ -130,10 +130,12 @@ class Rows:
     @property
     def scale(self) -> float:
         """Spread of the residuals; 1 or more."""
-        if not len(self.residual):
+        middle = len(self.residual) // 2
+        if not middle:
             return 1.0
         # Noise of real scenes exceeds that of the points.
-        return max(1.0, 1.4826 * float(np.median(np.abs(self.residual))))
+        # `np.median` imports 20 ms of masked arrays.
+        return max(1.0, 1.4826 * float(np.partition(np.abs(self.residual), middle)[middle]))
 
 
 class Problem:
