@@ -594,7 +594,10 @@ def _record_instead(directions: Sequence[str]) -> str:
         next(what for key, what in needed.items() if f": {key}" in direction)
         for direction in directions
     )
-    return f"also record {', and '.join(found)}, seen by both lidars at the same time, or correct a guess that is far off"
+    return (
+        f"also record {', and '.join(found)}, seen by both lidars at the same time, or correct a "
+        "guess that is far off"
+    )
 
 
 def _refuse_far(
