@@ -1,7 +1,7 @@
 """Times of decoded clouds as `inspect` checks them: sweeps of the first seconds, and the verdicts.
 
-The check itself is `poses.point_times`; here are the clouds that it needs, and its figures in
-words, with the key of the rig that would read the times as they fit.
+The check itself is `poses.point_times`; here are the clouds that it needs, and the keys of the rig
+that read the times as they fit.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ from mlbatch.discovery.types import DetectedSensor
 from mlbatch.poses.point_times import (
     DIFFERS,
     FITS,
+    MOVED,
     OPEN,
     DelayFit,
     OrderFit,
@@ -45,20 +46,24 @@ _MS_PER_S = 1000.0
 # Lengths of sweeps by their points: shots without a return at their ends are missing, s.
 _SWEEP_ERROR_S = 0.0005
 _SIGMAS = 4.0
+# A delay is taken for a header at the other end of a sweep within so many standard deviations; with
+# more uncertainty than this share of a sweep it may be a delay as well, and both are named.
+_NEAR_SIGMAS = 2.5
+_RESOLVED = 0.024
 
 
 @dataclass(frozen=True, slots=True)
 class TimeFinding:
     """How the times of the points of a lidar fit; see `inspect --json`.
 
-    order, delay: verdicts; opposite: whether points fit in the opposite order within a sweep;
-    late_ms, sigma_ms: against `reference`; residuals in mm; set: what to write in the rig.
+    order, delay: verdicts, and reasons where they are not decided; late_ms, sigma_ms: against
+    `reference`; residuals in mm, as in `OrderFit` and `DelayFit`; set: what to write in the rig.
     """
 
     sensor: str
     order: str
     order_reason: str = ""
-    order_residual_mm: tuple[float, float] = (0.0, 0.0)
+    order_residual_mm: tuple[float, float, float] = (0.0, 0.0, 0.0)
     delay: str = ""
     delay_reason: str = ""
     reference: str = ""
@@ -67,19 +72,33 @@ class TimeFinding:
     delay_residual_mm: tuple[float, float] = (0.0, 0.0)
     set: dict[str, str] = field(default_factory=dict)
 
+    @property
+    def is_open(self) -> bool:
+        """Whether the keys are alternatives: a header at the other end of a sweep, or a delay."""
+        return self.order == FITS and len(self.set) > 1
+
     def describe(self) -> str:
         """The finding as one line."""
         text = f"{self.sensor}: times of points within a sweep: {self._order()}"
         if self.delay:
             text += f"; against {self.reference}: {self._delay()}"
         if self.set:
-            keys = ", ".join(f"{name}: {value}" for name, value in self.set.items())
+            joined = ", or " if self.is_open else ", "
+            keys = joined.join(f"{name}: {value}" for name, value in self.set.items())
             text += f"; if the poses are right, write in the rig: {keys}"
+            if self.is_open:
+                text += ", which the motion does not separate"
         return text
 
     def _order(self) -> str:
-        read_mm, back_mm = self.order_residual_mm
+        read_mm, back_mm, once_mm = self.order_residual_mm
         figures = f"sweeps agree within {read_mm:.1f} mm, in the opposite order {back_mm:.1f} mm"
+        if self.order == MOVED:
+            return (
+                "points fit as if all were measured at one time, so the driver has moved them "
+                f"(sweeps agree within {once_mm:.1f} mm, with their times {read_mm:.1f} mm): "
+                "record the points as measured"
+            )
         if self.order == FITS:
             return f"the order fits ({figures})"
         if self.order == DIFFERS:
@@ -140,7 +159,7 @@ class CloudTimes:
             (
                 number
                 for number, (lidar, order) in enumerate(zip(lidars, orders, strict=True))
-                if order.verdict != OPEN and lidar.sensor.pose.is_known
+                if order.verdict in (FITS, DIFFERS) and lidar.sensor.pose.is_known
             ),
             None,
         )
@@ -165,7 +184,7 @@ class CloudTimes:
     ) -> DelayFit:
         if not lidars[number].sensor.pose.is_known:
             return DelayFit(OPEN, "its pose is not known")
-        if orders[number].verdict == OPEN:
+        if orders[number].verdict not in (FITS, DIFFERS):
             return DelayFit(OPEN, "the order within its sweeps is not decided")
         timed = [
             TimedLidar(tuple(lidars[one].sweeps), orders[one].verdict == DIFFERS)
@@ -181,13 +200,13 @@ class CloudTimes:
             lidar.sensor.name,
             order.verdict,
             order.reason,
-            _mm(order.residual_m),
+            (_mm(order.residual_m[0]), _mm(order.residual_m[1]), _mm(order.residual_m[2])),
             "" if delay is None else delay.verdict,
             "" if delay is None else delay.reason,
             "" if delay is None else reference.sensor.name,
             round(delay.late_s * _MS_PER_S, 3) if delay is not None and known else None,
             round(delay.sigma_s * _MS_PER_S, 3) if delay is not None and known else None,
-            (0.0, 0.0) if delay is None else _mm(delay.residual_m),
+            (0.0, 0.0) if delay is None else (_mm(delay.residual_m[0]), _mm(delay.residual_m[1])),
             self._keys(lidar, order, reference, delay),
         )
 
@@ -197,24 +216,27 @@ class CloudTimes:
         """What to write in the rig so that the times are read as they fit, by lidar and key."""
         origin = self._origin(lidar.sensor)
         name = lidar.sensor.name
-        late_s, near_s = 0.0, _SWEEP_ERROR_S
+        sweep_s = order.sweep_s
         is_known = delay is not None and delay.verdict != OPEN
-        if delay is not None and is_known:
-            late_s, near_s = delay.late_s, near_s + _SIGMAS * delay.sigma_s
+        late_s, sigma_s = (delay.late_s, delay.sigma_s) if delay and is_known else (0.0, 0.0)
+        near_s = _NEAR_SIGMAS * sigma_s + _SWEEP_ERROR_S
         found: dict[str, str] = {}
         if order.verdict == DIFFERS and origin in (START, END):
             found[f"{name} points"] = f"{{from: {BACK}}}"
-            late_s -= order.sweep_s if origin == START else 0.0
-        elif abs(late_s - order.sweep_s) <= near_s and origin == START:
+            late_s -= sweep_s if origin == START else 0.0
+            is_late = abs(late_s) > _SIGMAS * sigma_s + _SWEEP_ERROR_S
+        elif origin == START and abs(late_s - sweep_s) <= near_s:
             found[f"{name} points"] = f"{{from: {END}}}"
-            late_s -= order.sweep_s
-        elif abs(late_s + order.sweep_s) <= near_s and origin == END:
+            is_late = near_s > _RESOLVED * sweep_s
+        elif origin == END and abs(late_s + sweep_s) <= near_s:
             found[f"{name} points"] = f"{{from: {START}}}"
-            late_s += order.sweep_s
-        elif abs(late_s + order.sweep_s) <= near_s and self._origin(reference.sensor) == START:
+            is_late = near_s > _RESOLVED * sweep_s
+        elif self._origin(reference.sensor) == START and abs(late_s + sweep_s) <= near_s:
             found[f"{reference.sensor.name} points"] = f"{{from: {END}}}"
-            late_s += order.sweep_s
-        if is_known and abs(late_s) > near_s:
+            is_late = near_s > _RESOLVED * sweep_s
+        else:
+            is_late = delay is not None and delay.verdict == DIFFERS
+        if is_known and is_late:
             offset_s = lidar.sensor.offset_ns / NS_PER_S - late_s
             found[f"{name} clock"] = f"{{offset_s: {offset_s:.4f}}}"
         return found
@@ -227,8 +249,8 @@ class CloudTimes:
         return clouds.origins.get((stream.topic, clouds.frames.get(stream, "")), "")
 
 
-def _mm(residual_m: tuple[float, float]) -> tuple[float, float]:
-    return round(residual_m[0] * _MM_PER_M, 2), round(residual_m[1] * _MM_PER_M, 2)
+def _mm(residual_m: float) -> float:
+    return round(residual_m * _MM_PER_M, 2)
 
 
 class _Lidar:

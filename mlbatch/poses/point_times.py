@@ -28,7 +28,10 @@ from mlbatch.units import NS_PER_S
 # Verdicts.
 FITS = "fits"
 DIFFERS = "differs"
+MOVED = "moved"
 OPEN = "not decided"
+# Orders of the times within a sweep: as read, opposite, or all points at one time.
+AS_READ, OPPOSITE, AT_ONCE = 1, -1, 0
 
 # What moves less from one sweep to the next shows no time, m; turns count at this distance, m.
 _LEAST_MOTION_M = 0.08
@@ -49,6 +52,7 @@ _SPOTS = 8
 _FIRST_SPOTS = 4
 _FEWEST_SPOTS = 4
 _DELAYS_S = np.arange(-5, 6) * 0.03
+_STARTS = 3
 # How well poses of a rig are known: m, rad; and the motion at a spot: m/s, rad/s.
 _POSE_SIGMA = np.repeat([0.03, np.deg2rad(0.5)], 3)
 _TWIST_SIGMA = np.repeat([0.15, 0.03], 3)
@@ -61,7 +65,7 @@ _CLOSE_M = 0.02
 _FEWEST_SHARED = 15.0
 # A delay with a larger standard deviation is not known; errors of the model of motion, s.
 _MOST_SIGMA_S = 0.004
-_FLOOR_S = 0.001
+_FLOOR_S = 0.0005
 _SIGMAS = 4.0
 _STEPS = 4
 # Cauchy kernel: residuals of this many standard deviations have half of their weight.
@@ -85,12 +89,10 @@ class Sweep:
         """From its first to its last point."""
         return (int(self.stamp_ns.max()) - int(self.stamp_ns.min())) / NS_PER_S
 
-    def times_s(self, from_ns: int, *, is_back: bool) -> F64Array:
-        """Times (n,) from an instant; is_back: in the opposite order within the sweep."""
-        stamp_ns = self.stamp_ns
-        if is_back:
-            stamp_ns = int(stamp_ns.min()) + int(stamp_ns.max()) - stamp_ns
-        found: F64Array = (stamp_ns - from_ns) / NS_PER_S
+    def times_s(self, from_ns: int, order: int = AS_READ) -> F64Array:
+        """Times (n,) from an instant."""
+        middle_ns = self.middle_ns
+        found: F64Array = ((self.stamp_ns - middle_ns) * order + (middle_ns - from_ns)) / NS_PER_S
         return found
 
 
@@ -98,13 +100,14 @@ class Sweep:
 class OrderFit:
     """Whether the points of a lidar were measured in the order of their times within a sweep.
 
-    verdict: FITS, DIFFERS (in the opposite one) or OPEN, for a reason; residual_m: from each sweep
-    to those before, as read and in the opposite order; sweep_s: length of a sweep.
+    verdict: FITS, DIFFERS (in the opposite one), MOVED (points fit as if all were measured at one
+    time) or OPEN, for a reason; residual_m: from each sweep to those before, as read, in the
+    opposite order and at one time; sweep_s: length of a sweep.
     """
 
     verdict: str
     reason: str = ""
-    residual_m: tuple[float, float] = (0.0, 0.0)
+    residual_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
     sweep_s: float = 0.0
 
 
@@ -157,14 +160,14 @@ class Track:
 # -- one lidar -------------------------------------------------------------------------------------
 
 
-def track(sweeps: Sequence[Sweep], *, is_back: bool = False) -> Track:
-    """Motion by sweeps in order of time, as read or in the opposite order within each."""
+def track(sweeps: Sequence[Sweep], order: int = AS_READ) -> Track:
+    """Motion by sweeps that follow each other, with an order of the times within each."""
     estimator = VelocityEstimator()
     residual_m, at_ns, twists = [], [], []
     before_ns = 0
     for sweep in sweeps:
         middle_ns = sweep.middle_ns
-        time_s, column = np.unique(sweep.times_s(middle_ns, is_back=is_back), return_inverse=True)
+        time_s, column = np.unique(sweep.times_s(middle_ns, order), return_inverse=True)
         cloud = ColumnCloud(sweep.points_m, column, time_s)
         found = estimator.add(cloud, middle_ns, round(sweep.span_s * NS_PER_S))
         residual_m.append(np.nan if found.residual_m is None else found.residual_m)
@@ -183,21 +186,22 @@ def track(sweeps: Sequence[Sweep], *, is_back: bool = False) -> Track:
 
 def fit_order(sweeps: Sequence[Sweep], as_read: Track) -> OrderFit:
     """Compare the order of the times within the sweeps of one lidar with the opposite one."""
-    sweep_s = float(np.median([sweep.span_s for sweep in sweeps])) if sweeps else 0.0
+    # The seam may face the sky.
+    sweep_s = float(np.percentile([sweep.span_s for sweep in sweeps], 90)) if sweeps else 0.0
     moves = as_read.step_m(sweep_s) >= _LEAST_MOTION_M
     if not len(as_read.at_ns):
         return OrderFit(OPEN, "the lidar sees too little to follow its motion", sweep_s=sweep_s)
     if np.count_nonzero(moves) < _FEWEST_SWEEPS:
         return OrderFit(OPEN, "it stands, or hardly moves", sweep_s=sweep_s)
     part = _liveliest(moves)
-    back = track(sweeps[part], is_back=True)
-    forth = track(sweeps[part]) if part.start else as_read
-    both = np.stack([forth.residual_m[: len(back.residual_m)], back.residual_m])
-    kept = moves[part] & np.isfinite(both).all(axis=0)
+    residual_m = np.stack(
+        [track(sweeps[part], order).residual_m for order in (AS_READ, OPPOSITE, AT_ONCE)]
+    )
+    kept = moves[part] & np.isfinite(residual_m).all(axis=0)
     kept[:_UNSETTLED] = False
     if np.count_nonzero(kept) < _FEWEST_SWEEPS - _UNSETTLED:
         return OrderFit(OPEN, "too few sweeps match those before them", sweep_s=sweep_s)
-    return _decided_order(both[:, kept], sweep_s)
+    return _decided_order(residual_m[:, kept], sweep_s)
 
 
 def _liveliest(moves: BoolArray) -> slice:
@@ -208,22 +212,29 @@ def _liveliest(moves: BoolArray) -> slice:
     return slice(first, first + length)
 
 
-def _decided_order(both_m: F64Array, sweep_s: float) -> OrderFit:
-    """By residuals (2, n) as read and in the opposite order."""
-    read_m, back_m = np.median(both_m, axis=1).tolist()
+def _decided_order(residual_m: F64Array, sweep_s: float) -> OrderFit:
+    """By residuals (3, n) as read, in the opposite order and at one time."""
+    as_read, opposite, at_once = residual_m
+    verdict, reason = OPEN, "no order fits clearly better"
+    if _is_better(at_once, as_read) and _is_better(at_once, opposite):
+        verdict, reason = MOVED, ""
+    elif _is_better(as_read, opposite):
+        verdict, reason = FITS, ""
+    elif _is_better(opposite, as_read):
+        verdict, reason = DIFFERS, ""
+    read_m, back_m, once_m = np.median(residual_m, axis=1).tolist()
+    return OrderFit(verdict, reason, (read_m, back_m, once_m), sweep_s)
+
+
+def _is_better(one_m: F64Array, other_m: F64Array) -> bool:
+    """Whether residuals (n,) are proven to be smaller than others of the same sweeps."""
     # Sweeps that follow each other share their map.
-    blocks = np.array_split(both_m[1] - both_m[0], max(2, both_m.shape[1] // 2))
+    blocks = np.array_split(other_m - one_m, max(2, len(one_m) // 2))
     change_m = np.array([block.mean() for block in blocks])
     error_m = change_m.std(ddof=1) / np.sqrt(len(change_m))
-    proof = change_m.mean() / max(error_m, 1e-9)
-    is_back = proof < 0
-    share = float(np.mean((change_m < 0) == is_back))
-    factor = max(read_m, back_m) / max(min(read_m, back_m), 1e-9)
-    is_clear = is_back == (back_m < read_m) and factor >= _FACTOR
-    if abs(proof) < _PROVEN or share < _SHARE or not is_clear:
-        reason = "both orders fit nearly as well"
-        return OrderFit(OPEN, reason, (read_m, back_m), sweep_s)
-    return OrderFit(DIFFERS if is_back else FITS, "", (read_m, back_m), sweep_s)
+    is_clear = np.median(other_m) >= _FACTOR * np.median(one_m)
+    is_usual = np.mean(change_m > 0) >= _SHARE
+    return bool(is_clear and is_usual and change_m.mean() >= _PROVEN * error_m)
 
 
 # -- two lidars ------------------------------------------------------------------------------------
@@ -326,7 +337,7 @@ class _Pair:
                 late_ns = round(late_s * NS_PER_S) if number else 0
                 instant_ns = self.instants_ns[spot] + late_ns
                 for sweep in lidar.nearest(instant_ns):
-                    time_s = sweep.times_s(instant_ns, is_back=lidar.is_back)
+                    time_s = sweep.times_s(instant_ns, OPPOSITE if lidar.is_back else AS_READ)
                     points_m = moved(sweep.points_m, time_s**2 / 2, self.changes[spot])
                     place.append(Cloud(number, points_m, time_s))
             places.append(place)
@@ -352,7 +363,21 @@ def fit_delay(reference: TimedLidar, lidar: TimedLidar, motion: Track, sweep_s: 
     for late_s in _DELAYS_S.tolist():
         agreed = _Agreement(pair.places(late_s, lively), start, _NEAR_M)
         tried.append((agreed.total, late_s))
-    late_s = max(tried)[1]
+    as_read = _Agreement(pair.places(0.0, every), pair.start(every), _CLOSE_M)
+    # A search may end at another delay than the best one.
+    found, best = _solved(pair, max(tried)[1], as_read)
+    for _, late_s in sorted(tried, reverse=True)[1:_STARTS]:
+        if found.verdict != OPEN:
+            break
+        other, agreed_others = _solved(pair, late_s, as_read)
+        if other.verdict != OPEN and agreed_others > best:
+            return other
+    return found
+
+
+def _solved(pair: _Pair, late_s: float, as_read: _Agreement) -> tuple[DelayFit, float]:
+    """The delay that is found from a first one, and the number of surfaces that then agree."""
+    every = list(range(len(pair.twists)))
     state = pair.start(every)
     for level in (LEVELS[1], FINE, FINE):
         solution = _Solution(pair.places(late_s, every), pair.twists)
@@ -363,18 +388,16 @@ def fit_delay(reference: TimedLidar, lidar: TimedLidar, motion: Track, sweep_s: 
         state.delay_s[1] = 0.0
     sigma_s = float(np.hypot(solution.sigma_s, _FLOOR_S))
     solved = _Agreement(pair.places(late_s, every), state, _CLOSE_M)
-    as_read = _Agreement(pair.places(0.0, every), pair.start(every), _CLOSE_M)
-    residual_m = as_read.residual_m, solved.residual_m
+    reason, verdict = "", FITS if abs(late_s) <= _SIGMAS * sigma_s else DIFFERS
     if solved.shared < _FEWEST_SHARED * len(every):
-        return DelayFit(OPEN, "they see too little in common", residual_m=residual_m)
-    if (np.abs(pose_off(state.corrections[1])) > _MOST_POSE_SIGMAS * _POSE_SIGMA).any():
-        return DelayFit(OPEN, "their poses do not fit", late_s, sigma_s, residual_m)
-    if abs(change_s) > sigma_s or sigma_s > _MOST_SIGMA_S:
+        reason, late_s, sigma_s = "they see too little in common", 0.0, 0.0
+    elif (np.abs(pose_off(state.corrections[1])) > _MOST_POSE_SIGMAS * _POSE_SIGMA).any():
+        reason = "their poses do not fit"
+    elif abs(change_s) > sigma_s or sigma_s > _MOST_SIGMA_S or solved.total < as_read.total:
         reason = "motion and what both see do not determine it"
-        return DelayFit(OPEN, reason, late_s, sigma_s, residual_m)
-    if abs(late_s) <= _SIGMAS * sigma_s:
-        return DelayFit(FITS, "", late_s, sigma_s, residual_m)
-    return DelayFit(DIFFERS, "", late_s, sigma_s, residual_m)
+    residual_m = as_read.residual_m, solved.residual_m
+    fit = DelayFit(OPEN if reason else verdict, reason, late_s, sigma_s, residual_m)
+    return fit, solved.total
 
 
 def _steps_m(twists: F64Array) -> F64Array:

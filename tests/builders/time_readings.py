@@ -71,13 +71,15 @@ READINGS = (
 
 @dataclass(frozen=True)
 class Drive:
-    """Points of each lidar in its frame and their true times, by sweep; rig: its text.
+    """Points of each lidar in its frame and their true times, by sweep.
 
-    sweeps: of each lidar, (stamp_ns (n,), points (n, 3), first nanosecond of the sweep).
+    sweeps: of each lidar, (stamp_ns (n,), points (n, 3), first nanosecond of the sweep); truth:
+    file of the true poses.
     """
 
     sweeps: Sequence[Sequence[tuple[I64Array, F64Array, int]]]
     poses: Sequence[F64Array]
+    truth: Path
 
 
 def scenario(seed: int, *, moving: bool = True, duration_s: float = 4.0) -> str:
@@ -156,7 +158,7 @@ def drive(folder: Path, text: str, seed: int = 0) -> Drive:
             rows = index == sweep
             parts.append((stamp_ns[rows], local[rows], sweep * SWEEP_NS + int(cut_ns[number])))
         sweeps.append(parts)
-    return Drive(sweeps, poses)
+    return Drive(sweeps, poses, folder / "drive.truth.tum")
 
 
 def write_clouds(

@@ -9,11 +9,13 @@ import numpy as np
 import pytest
 
 from mlbatch.arrays import F64Array
+from mlbatch.motion.se3 import rotations_of
 from mlbatch.pipeline.cloud_times import TimeFinding
 from mlbatch.pipeline.inspect import inspect
 from mlbatch.poses.point_times import (
     DIFFERS,
     FITS,
+    MOVED,
     OPEN,
     Sweep,
     TimedLidar,
@@ -23,6 +25,7 @@ from mlbatch.poses.point_times import (
 )
 from mlbatch.ros.point_packets import CloudError
 from mlbatch.ros.point_times import CONVENTION, Zero, stamps
+from tests.builders.simulated import at_true_poses, read_tum
 from tests.builders.time_readings import (
     READINGS,
     SWEEP_NS,
@@ -67,6 +70,19 @@ def test_readings(moved: Drive, is_back: bool, late_ms: int) -> None:
     assert abs(found.late_s - late_ms / 1000) < min(0.005, 4 * found.sigma_s)
     if late_ms:
         assert found.residual_m[1] < 0.5 * found.residual_m[0]
+
+
+def test_points_that_a_driver_moved_to_one_time_are_named(moved: Drive) -> None:
+    stamps_ns, poses = read_tum(moved.truth)
+    deskewed = []
+    for sweep in _sweeps(moved, 0):
+        world_m = at_true_poses(sweep.points_m, sweep.stamp_ns.astype(np.float64), moved.truth)
+        pose = poses[np.searchsorted(stamps_ns, sweep.middle_ns)]
+        body_m = np.matmul(world_m - pose[:3], rotations_of(pose[None, 3:])[0])
+        deskewed.append(Sweep(body_m, sweep.stamp_ns))
+    found = fit_order(deskewed, track(deskewed))
+    assert found.verdict == MOVED
+    assert found.residual_m[2] < found.residual_m[0]
 
 
 def test_at_rest_nothing_is_decided(moved: Drive) -> None:
