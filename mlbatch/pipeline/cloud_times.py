@@ -47,7 +47,7 @@ _MS_PER_S = 1000.0
 _SWEEP_ERROR_S = 0.0005
 _SIGMAS = 4.0
 # A delay is taken for a header at the other end of a sweep within so many standard deviations; with
-# more uncertainty than this share of a sweep it may be a delay as well, and both are named.
+# more uncertainty than this share of a sweep, or half of it off, both are named.
 _NEAR_SIGMAS = 2.5
 _RESOLVED = 0.024
 
@@ -227,13 +227,13 @@ class CloudTimes:
             is_late = abs(late_s) > _SIGMAS * sigma_s + _SWEEP_ERROR_S
         elif origin == START and abs(late_s - sweep_s) <= near_s:
             found[f"{name} points"] = f"{{from: {END}}}"
-            is_late = near_s > _RESOLVED * sweep_s
+            is_late = max(near_s, 2 * abs(late_s - sweep_s)) > _RESOLVED * sweep_s
         elif origin == END and abs(late_s + sweep_s) <= near_s:
             found[f"{name} points"] = f"{{from: {START}}}"
-            is_late = near_s > _RESOLVED * sweep_s
+            is_late = max(near_s, 2 * abs(late_s + sweep_s)) > _RESOLVED * sweep_s
         elif self._origin(reference.sensor) == START and abs(late_s + sweep_s) <= near_s:
             found[f"{reference.sensor.name} points"] = f"{{from: {END}}}"
-            is_late = near_s > _RESOLVED * sweep_s
+            is_late = max(near_s, 2 * abs(late_s + sweep_s)) > _RESOLVED * sweep_s
         else:
             is_late = delay is not None and delay.verdict == DIFFERS
         if is_known and is_late:
