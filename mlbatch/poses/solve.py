@@ -35,7 +35,7 @@ _MOST_SIGMA_M = 0.005
 _TRUE_SHARE = 0.3
 _FEWEST_BLOCKS = 3.0
 # Errors of lidars that no scene shows, m and rad.
-_FLOOR_M, _FLOOR_RAD = 0.0005, 0.0001
+_FLOOR_M, _FLOOR_RAD = 0.001, 0.000175
 # A direction that is not determined, m.
 _UNKNOWN_M = 1.0
 # Twists of vehicles, standard deviations, m/s and rad/s.
