@@ -97,8 +97,7 @@ def joined_cloud(
     the compression, 0 to 9.
     """
     parts = [_valid(scan) for scan in scans]
-    xyz: F64Array = np.concatenate([part.xyz for part in parts]).astype(np.float64)
-    total = len(xyz)
+    total = sum(len(part.xyz) for part in parts)
     lidars = [part.lidar for part in parts if part.lidar is not None]
     times = [part.time_ns for part in parts if part.time_ns is not None]
     rings = [part.ring for part in parts if part.ring is not None]
@@ -114,23 +113,27 @@ def joined_cloud(
     time_ns: I64Array = np.concatenate(times) if has_time else none
     ring: I64Array = np.concatenate(rings) if has_ring else none
     intensity: F64Array = np.concatenate(bright) if has_intensity else none.astype(np.float64)
-    # Points without times are in the order of their columns.
-    share = time_ns / window_ns if has_time else np.arange(total) / max(1, total)
-    column = _columns(share, lidar, expected)
-    order = np.lexsort((share, ring, lidar))
-    order = order[column[order] % stride == 0]
-    xyz = xyz[order]
-    low_m: F64Array = xyz.min(axis=0) if len(xyz) else np.zeros(3)
-    high_m: F64Array = xyz.max(axis=0) if len(xyz) else np.zeros(3)
+    # By lidar and ring; those of one are in the order of their columns already.
+    order = np.argsort(ring.astype(np.uint16), kind="stable")
+    order = order[np.argsort(lidar[order], kind="stable")]
+    if stride > 1:
+        # Points without times are in the order of their columns.
+        share = time_ns / window_ns if has_time else np.arange(total) / max(1, total)
+        order = order[_columns(share, lidar, expected)[order] % stride == 0]
+    # By axis: numpy is slow in loops over three values.
+    points = np.concatenate([part.xyz for part in parts])
+    xyz: F64Array = points[order].T.astype(np.float64, order="C")
+    low_m: F64Array = xyz.min(axis=1) if len(order) else np.zeros(3)
+    high_m: F64Array = xyz.max(axis=1) if len(order) else np.zeros(3)
     step_m = max(float((high_m - low_m).max()) / _WORD, _STEP_M)
     centre_m, view_m = _view(xyz, lidar[order])
     return PageCloud(
         place=place,
         total=total,
         stride=stride,
-        shown=len(xyz),
+        shown=len(order),
         packed=_packed(
-            np.rint((xyz - low_m) / step_m).astype(np.uint16),
+            np.rint((xyz - low_m[:, None]) / step_m).astype(np.uint16),
             np.rint((time_ns[order] - first_ns) / (last_ns - first_ns) * _WORD),
             ring[order],
             lidar[order],
@@ -140,7 +143,7 @@ def joined_cloud(
         low_m=(float(low_m[0]), float(low_m[1]), float(low_m[2])),
         step_m=step_m,
         times_ms=(first_ns / NS_PER_MS, last_ns / NS_PER_MS),
-        height_m=_span(xyz[:, 2]),
+        height_m=_span(xyz[2]),
         centre_m=(float(centre_m[0]), float(centre_m[1]), float(centre_m[2])),
         view_m=view_m,
         has_lidar=has_lidar,
@@ -151,8 +154,9 @@ def joined_cloud(
 
 
 def _valid(scan: StoredScan) -> _Points:
-    finite: BoolArray = np.isfinite(scan.xyz)
-    valid = np.asarray(finite.all(axis=-1))
+    # Faster than `all` over three values.
+    x, y, z = (np.isfinite(scan.xyz[..., axis]) for axis in range(3))
+    valid: BoolArray = x & y & z
     count = int(np.count_nonzero(valid))
     lidar: U8Array | None = None
     if scan.sensor is not None:
@@ -189,7 +193,7 @@ def _packed(
     intensity: U8Array,
     level: int,
 ) -> bytes:
-    words = (*xyz.T, time, ring)
+    words = (*xyz, time, ring)
     planes = [_differences(np.asarray(plane).astype(np.uint16)) for plane in words]
     # Of level 6, level 9 takes 3 to 6 times as long for 1.6 % less.
     coder = zlib.compressobj(level, wbits=-15)
@@ -211,18 +215,18 @@ def _view(xyz: F64Array, lidar: U8Array) -> tuple[F64Array, float]:
     """Centre (3,) and radius of a view, m, that has most points of every lidar.
 
     The centre is the body; where the cloud is farther away than it is large, it is that of the
-    cloud.
+    cloud. xyz: (3, p).
     """
-    parts = [xyz[lidar == number] for number in np.unique(lidar)]
+    parts = [xyz[:, lidar == number] for number in np.unique(lidar)]
     if not parts:
         return np.zeros(3), 1.0
-    boxes = np.array([[_span(part[:, axis]) for axis in range(3)] for part in parts])
+    boxes = np.array([[_span(part[axis]) for axis in range(3)] for part in parts])
     low_m = boxes[:, :, 0].min(axis=0)
     high_m = boxes[:, :, 1].max(axis=0)
     centre_m: F64Array = (low_m + high_m) / 2
     if np.linalg.norm(centre_m) <= np.linalg.norm(high_m - low_m):
         centre_m = np.zeros(3)
-    away_m = [np.linalg.norm(part[:, :2] - centre_m[:2], axis=1) for part in parts]
+    away_m = [np.hypot(part[0] - centre_m[0], part[1] - centre_m[1]) for part in parts]
     return centre_m, max(1.0, *(_quantile(away, _IN_VIEW) for away in away_m))
 
 
@@ -230,7 +234,8 @@ def _quantile(values: F64Array, share: float) -> float:
     """A value of the array by nearest rank; 0 without one."""
     if not len(values):
         return 0.0
-    return float(np.sort(values)[int(share * (len(values) - 1))])
+    rank = int(share * (len(values) - 1))
+    return float(np.partition(values, rank)[rank])
 
 
 def _span(values: F64Array) -> tuple[float, float]:

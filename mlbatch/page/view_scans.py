@@ -63,12 +63,12 @@ class ViewScans:
                 return self._kept[number]
             if self._end and number >= self._next:
                 return self._end
-            if number < self._next:
-                self._windows.close()
-                self._windows = _windows(self._begin())
-                self._next = 0
-                self._end = b""
             try:
+                if number < self._next:
+                    self._windows.close()
+                    self._next = 0
+                    self._end = b""
+                    self._windows = _windows(self._begin())
                 while self._next <= number:
                     parts = next(self._windows, None)
                     if parts is None:

@@ -222,7 +222,7 @@ def test_the_view_has_most_points_of_every_lidar(
         ring = np.stack([50 * np.cos(turn), 50 * np.sin(turn), np.sin(7 * turn)], axis=1)
         parts.append(ring + place)
     lidar = np.repeat(np.arange(len(counts), dtype=np.uint8), counts)
-    found, view_m = _view(np.concatenate(parts), lidar)
+    found, view_m = _view(np.concatenate(parts).T, lidar)
     assert found == pytest.approx(centre, abs=2)
     assert view_m == pytest.approx(radius, abs=5)
 
