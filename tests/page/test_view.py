@@ -202,7 +202,7 @@ def test_a_source_that_is_gone_is_an_error() -> None:
     said: list[str] = []
     scans = ViewScans(begin, said.append)
     assert header_of(scans.get(39))["title"] == "Scan 39, +3.9 s"
-    assert "restore it" in header_of(scans.get(0))["error"]
+    assert "restore it" in header_of(scans.get(1))["error"]
     assert len(said) == 1
 
 
