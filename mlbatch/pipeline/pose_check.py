@@ -8,11 +8,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 
-from mlbatch.arrays import F64Array, I64Array
+from mlbatch.arrays import F32Array, F64Array, I64Array, U8Array
 from mlbatch.decode.decoder import Decoder, ScanHeader
 from mlbatch.frames.transforms import from_rpy_deg
 from mlbatch.pipeline.sensor import Sensor
@@ -25,6 +25,8 @@ if TYPE_CHECKING:
 
 # Of a lidar in a window; of more, every second column is read, or every third.
 _SLOTS = 1 << 15
+# Points (n, 3) of a window or slice, their times (n,) in ns, their lidars (n,).
+_Points: TypeAlias = tuple[F32Array, I64Array, U8Array]
 # Nearer points are of the machine, farther ones too sparse to show surfaces.
 _NEAREST_M, _FARTHEST_M = 1.0, 60.0
 
@@ -48,8 +50,8 @@ class PoseCheck:
         self._windows = -1
         self._index: int | None = None
         self._next = 1
-        # Windows of a place by index: points (n, 3), times (n,) in ns, lidars (n,) of each slice.
-        self._place: dict[int, list[tuple[F64Array, I64Array, I64Array]]] = {}
+        # Windows of a place by index.
+        self._place: dict[int, list[_Points]] = {}
 
     def add(self, window: Window) -> None:
         """Add the next window, or slice."""
@@ -83,7 +85,7 @@ class PoseCheck:
             return PoseFigures("fewer than three windows")
         return PoseFigures(pairs=self._comparison.figures())
 
-    def _points(self, window: Window) -> tuple[F64Array, I64Array, I64Array]:
+    def _points(self, window: Window) -> _Points:
         """Points of some columns; columns of a sensor are taken at equal steps."""
         columns = window.columns
         taken: list[I64Array] = []
@@ -99,7 +101,7 @@ class PoseCheck:
         )
         scan = self._decoder.scan(some, header)
         stamp_ns = scan.time_ns.astype(np.int64) + window.start_ns
-        return scan.xyz.astype(np.float64), stamp_ns, scan.lidar_id.astype(np.int64)
+        return scan.xyz.copy(), stamp_ns, scan.lidar_id.copy()
 
     def _compare(self, last: Window) -> None:
         """Compare the clouds of a place."""
@@ -119,7 +121,8 @@ class PoseCheck:
             time_s = (stamp_ns - last.start_ns) / NS_PER_S
             for number, origin_m in enumerate(self._origins_m):
                 own = np.flatnonzero(lidar == number)
-                squared = ((points_m[own] - origin_m) ** 2).sum(axis=1)
+                away_m = points_m[own] - origin_m.astype(np.float32)
+                squared = np.einsum("ni,ni->n", away_m, away_m)
                 rows = own[(squared > _NEAREST_M**2) & (squared < _FARTHEST_M**2)]
                 clouds.append(Cloud(number, points_m[rows], time_s[rows], origin_m))
         self._comparison.add(clouds)

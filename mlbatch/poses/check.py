@@ -47,10 +47,11 @@ _MOST_SIGMA_M = 0.015
 _MOST_SIGMA_RAD = float(np.deg2rad(0.15))
 # Places that agree, at least.
 _LEAST_PLACES = 2
-# Places are compared until so many were; enough if all is clear, and if nothing is in common.
+# Places are compared until so many were; enough if all is clear, or nothing is in common.
 _MOST_PLACES = 6
 _CLEAR_PLACES = 2
-_ENOUGH = 3
+# Places that are kept, to try other poses on.
+_KEPT = 3
 # Points of a cloud that are used, and where few surfaces are matched, all.
 _POINTS = 11_000
 _FEW_SURFACES = 40
@@ -164,7 +165,7 @@ class PoseComparison:
         if self.places >= _MOST_PLACES:
             return True
         pairs = self._measured()
-        if self.places >= _ENOUGH and not any(pair.surfaces for pair in pairs):
+        if not any(pair.surfaces for pair in pairs):
             return True
         return all(map(self._is_clear, pairs))
 
@@ -173,18 +174,19 @@ class PoseComparison:
         self.places += 1
         few = [self._reduced(cloud) for cloud in place]
         problem, solution = self._solved(few)
-        if solution.weak.shape[1] >= _WEAK and not self._needs_stems:
+        # Where nothing is in common, stems would add nothing either.
+        is_open = _across(solution) and solution.weak.shape[1] >= _WEAK
+        if is_open and not self._needs_stems:
             self._needs_stems = True
             problem, solution = self._solved([self._reduced(cloud) for cloud in place])
         misfit = self._count(problem.first)
-        matched = sum(count for (one, other), count in solution.matched.items() if one != other)
-        if not self._needs_all and 0 < matched < _FEW_SURFACES:
+        if not self._needs_all and 0 < _across(solution) < _FEW_SURFACES:
             self._needs_all = True
-            problem, solution = self._solved(place)
+            problem, solution = self._solved([self._reduced(cloud) for cloud in place])
         found = _estimate(solution)
         is_off = misfit or (found is not None and _seems_off(found))
         if is_off or found is None:
-            self._kept = [*self._kept, place][-_ENOUGH:]
+            self._kept = [*self._kept, place][-_KEPT:]
         if is_off:
             state = solve(problem, problem.start(), _COARSE, _STEPS).state
             found = _estimate(solve(problem, state, _MIDDLE, _STEPS))
@@ -195,7 +197,8 @@ class PoseComparison:
         """What is used of a cloud: as much as the places so far needed."""
         step = 1 if self._needs_all else max(1, len(cloud.points_m) // _POINTS)
         origin_m = cloud.origin_m if self._needs_stems else None
-        return Cloud(cloud.lidar, cloud.points_m[::step], cloud.time_s[::step], origin_m)
+        points_m = cloud.points_m[::step].astype(np.float64)
+        return Cloud(cloud.lidar, points_m, cloud.time_s[::step], origin_m)
 
     def _solved(self, place: Place) -> tuple[_Watched, Solution]:
         """Corrections by one step, or where the machine is fast by more."""
@@ -376,6 +379,11 @@ def _moved(cloud: Cloud, move: F64Array) -> Cloud:
     if origin_m is not None:
         origin_m = np.matmul(move[:3, :3], origin_m) + move[:3, 3]
     return Cloud(cloud.lidar, points_m, cloud.time_s, origin_m)
+
+
+def _across(solution: Solution) -> int:
+    """Number of distances between surfaces of two lidars."""
+    return sum(count for (one, other), count in solution.matched.items() if one != other)
 
 
 def _estimate(solution: Solution) -> _Estimate | None:
