@@ -128,6 +128,9 @@ def calibrate(
         typer.echo("")
         for line in table_lines(found.pair_rows()):
             typer.echo(line)
+    if found.level:
+        typer.echo("")
+        typer.echo(paragraph(f"note: {found.level}"))
     for path in (output, html):
         if path is not None:
             typer.echo(one_line(f"wrote {path}"))

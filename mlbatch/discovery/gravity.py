@@ -10,6 +10,7 @@ from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 
+from mlbatch.arrays import F64Array
 from mlbatch.discovery.router import Role, Router
 from mlbatch.discovery.sampler import Sampler
 from mlbatch.discovery.types import DetectedSensor, Note
@@ -29,17 +30,8 @@ def gravity_notes(
     sampler: Sampler, router: Router, sensors: Sequence[DetectedSensor], body_frame: str
 ) -> Iterator[Note]:
     """Warnings about sensors whose pose turns the gravity of their own IMU from the vertical."""
-    for number, sensor in enumerate(sensors):
-        sensor_from_imu = sensor.lidar.sensor_from_imu() if sensor.pose.is_known else None
-        parts = list(_samples(sampler, router, number, sensor))
-        if sensor_from_imu is None or not parts:
-            continue
-        gravity = mean_gravity(parts)
-        if gravity is None:
-            continue
-        up = sensor.pose.body_from_sensor[:3, :3] @ sensor_from_imu[:3, :3] @ gravity
-        up /= np.linalg.norm(up)
-        vertical = next(axis for end, axis in _UP.items() if body_frame.endswith(end))
+    vertical = vertical_of(body_frame)
+    for sensor, up in ups(sampler, router, sensors):
         tilted_deg = tilt_deg(up, np.array(vertical))
         if tilted_deg <= MOST_TILT_DEG:
             continue
@@ -53,6 +45,26 @@ def gravity_notes(
             "body frame in _ned or _frd (z downward) or _optical (y downward)"
         )
         yield Note("pose_gravity", sensor.name, text)
+
+
+def vertical_of(body_frame: str) -> tuple[float, float, float]:
+    """The axis of the body that points upward, by the name of its frame."""
+    return next(axis for end, axis in _UP.items() if body_frame.endswith(end))
+
+
+def ups(
+    sampler: Sampler, router: Router, sensors: Sequence[DetectedSensor]
+) -> Iterator[tuple[DetectedSensor, F64Array]]:
+    """Sensors with pose and IMU, and up (3,) by its gravity in the first seconds, body frame."""
+    for number, sensor in enumerate(sensors):
+        sensor_from_imu = sensor.lidar.sensor_from_imu() if sensor.pose.is_known else None
+        parts = list(_samples(sampler, router, number, sensor))
+        if sensor_from_imu is None or not parts:
+            continue
+        gravity = mean_gravity(parts)
+        if gravity is not None:
+            up = sensor.pose.body_from_sensor[:3, :3] @ sensor_from_imu[:3, :3] @ gravity
+            yield sensor, up / np.linalg.norm(up)
 
 
 def _samples(

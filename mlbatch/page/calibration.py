@@ -73,7 +73,9 @@ def _verdict(found: Calibration) -> Verdict:
         f"{100 * worst.after.share:.0f} % of the surfaces in common agree within 10 cm, with the "
         f"guess {100 * worst.before.share:.0f} %. All six directions of every pose are determined."
     )
-    return Verdict("good", "Calibration", heading, others, found.title())
+    if found.level:
+        others += f" {found.level}."
+    return Verdict("note" if found.level else "good", "Calibration", heading, others, found.title())
 
 
 def _kind(number: int) -> str:

@@ -123,6 +123,7 @@ class Calibration:
     places: number that the poses were solved on; held_out: number that they were measured on;
     different: places between which the machine moved; windows: of the recording; steps: windows
     whose motion was used (--from-motion); view: a picture, None of poses from motion alone.
+    level: what the IMU of the first lidar says of its pose, or "".
     """
 
     lidars: tuple[LidarPose, ...]
@@ -133,6 +134,7 @@ class Calibration:
     windows: int
     view: View | None
     steps: int = 0
+    level: str = ""
 
     def title(self) -> str:
         """What the poses come from, in a line."""
@@ -180,6 +182,7 @@ class Calibration:
             "different": self.different,
             "windows": self.windows,
             "steps": self.steps,
+            "level": self.level,
             "lidars": [
                 {
                     "name": lidar.name,

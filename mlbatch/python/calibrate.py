@@ -11,9 +11,13 @@ from pathlib import Path
 import numpy as np
 
 from mlbatch.arrays import F64Array
+from mlbatch.discovery.discover import Discovery
+from mlbatch.discovery.gravity import ups, vertical_of
 from mlbatch.errors import ExportError, NoScanError, RecordingError, RigError, UsageError
-from mlbatch.frames.transforms import compose, inverse
+from mlbatch.frames.transforms import compose, inverse, rpy_deg
+from mlbatch.motion.gravity import tilt_deg
 from mlbatch.motion.registration import Pose
+from mlbatch.motion.se3 import exp_rotation
 from mlbatch.pipeline.conversion import Conversion, Progress
 from mlbatch.pipeline.job import Job
 from mlbatch.poses.calibration import (
@@ -40,6 +44,8 @@ from mlbatch.writers import check_name
 
 # Windows in which a machine moves evenly, Hz.
 _RATE = 10
+# The ground is rarely more level, and a moving IMU feels more than gravity.
+_LEVEL_DEG = 2.0
 
 
 def calibrate_job(
@@ -109,6 +115,42 @@ def calibrate(
             f"calibrate: expected two lidars or more, found {names[0]} alone; give the recordings "
             "of all, and a rig with all of them"
         )
+    level = _level(run.session.setup, names[0])
+    found = _calibrated(
+        run, names, time_offset=time_offset, from_motion=from_motion, progress=progress
+    )
+    return replace(found, level=level)
+
+
+def _level(setup: Discovery, first: str) -> str:
+    """What the IMU of the first lidar says of its pose, which is taken as it is."""
+    vertical = vertical_of(setup.frame_id)
+    for sensor, up in ups(setup.sampler, setup.router, setup.sensors):
+        tilted_deg = tilt_deg(up, np.array(vertical))
+        if sensor.name != first or tilted_deg < _LEVEL_DEG:
+            continue
+        across = np.cross(up, vertical)
+        across *= np.deg2rad(tilted_deg) / max(float(np.linalg.norm(across)), 1e-9)
+        levelled = sensor.pose.body_from_sensor.copy()
+        levelled[:3, :3] = exp_rotation(across[None])[0] @ levelled[:3, :3]
+        angles = ", ".join(f"{round(angle, 1) + 0.0:.1f}" for angle in rpy_deg(levelled))
+        return (
+            f"{first}: its IMU finds the vertical {tilted_deg:.1f} degrees off with this pose, "
+            "which all others are relative to; where the machine stood level in the first "
+            f"seconds, rotation_rpy_deg: [{angles}] makes it level"
+        )
+    return ""
+
+
+def _calibrated(
+    run: Conversion,
+    names: Sequence[str],
+    *,
+    time_offset: bool,
+    from_motion: bool,
+    progress: Progress | None,
+) -> Calibration:
+    job = run.job
     poses = [sensor.pose.body_from_sensor for sensor in run.session.setup.sensors]
     if not from_motion:
         return calibrated(_places(run, progress), names, poses, delays=time_offset)

@@ -73,7 +73,7 @@ class PairFigures(NamedTuple):
             found = f"they agree within {_bounds([self])}"
         text = f"{seen}; {found}"
         if self.undetermined:
-            text += f" (not determined by the scene: {', '.join(self.undetermined)})"
+            text += f" (this check does not determine: {', '.join(self.undetermined)})"
         return text + self._cause()
 
     def _cause(self) -> str:

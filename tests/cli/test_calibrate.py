@@ -6,6 +6,7 @@ Truth: the rig of `fixtures/moving`, which its scenario gives.
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 
 import numpy as np
@@ -104,3 +105,21 @@ def test_mistakes(shell: Shell, name: str) -> None:
     assert (outcome.code > 0, outcome.out) == (True, "")
     assert message in outcome.err
     assert outcome.err.count("\n") == 1
+
+
+def test_the_imu_of_the_first_lidar_says_that_it_is_not_level(shell: Shell) -> None:
+    """The guess lacks its pitch of 10 degrees; the trolley stands at first."""
+    text = GUESS.replace("EXTRINSICS", ROUGH).replace("[0, 10, 80]", "[0, 0, 80]")
+    Path("guess.yaml").write_text(text, encoding="utf-8")
+    outcome = shell(f"calibrate {DRIVE} --rig guess.yaml --json")
+    assert outcome.code == 0
+    found = re.search(
+        r"left: its IMU finds the vertical ([\d.]+) degrees off .*rotation_rpy_deg: \[(.*)\]",
+        json.loads(outcome.out)["level"],
+    )
+    assert found
+    assert float(found[1]) == pytest.approx(10.0, abs=1.5)
+    # The trolley sways by 1 degree at most, its IMU is off by 0.3.
+    assert [float(angle) for angle in found[2].split(",")] == pytest.approx([0, 10, 80], abs=1.5)
+    _guess()
+    assert json.loads(shell(f"calibrate {DRIVE} --rig guess.yaml --json").out)["level"] == ""

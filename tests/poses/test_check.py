@@ -217,7 +217,7 @@ PAIR = PairFigures(("left", "right"), MEASURED, "", 3, 90, 41.2, 100.0, 6.0, 1.0
         (
             PAIR._replace(shift_mm=None, undetermined=("shift along x",)),
             "left and right have 41 % of their surfaces in common; they agree within 0.05 degrees "
-            "(not determined by the scene: shift along x)",
+            "(this check does not determine: shift along x)",
         ),
         (
             PairFigures(("left", "right"), NOT_CHECKED, "the lidars see nothing in common"),
