@@ -1,10 +1,10 @@
 "use strict";
 // Controls of a viewer: play, choice of scans, colours, keys, legend; see the macro `player`.
 
-// data: sensors, poses, begin (number of the first scan to show), play_ms (between two scans), ahead
-// (scans to load while playing). load(number): the unpacked scan, perhaps later; null after the
-// last; rejected with a reason that the page shows. last(): the largest number known. Gives a
-// function that draws again.
+// data: sensors, poses, begin (number of the first scan to show), play_ms (between two scans),
+// ahead (scans to load while playing), is_played (see `makeViewer`). load(number): the unpacked
+// scan, perhaps later; null after the last; rejected with a reason that the page shows. last(): the
+// largest number known. Gives a function that draws again.
 function startPlayer(data, load, last) {
   const byId = (id) => document.getElementById(id);
   const canvas = byId("cloud"), slider = byId("scan"), play = byId("play");
@@ -17,7 +17,7 @@ function startPlayer(data, load, last) {
     byId("stage").hidden = true;
     return () => {};
   }
-  const viewer = makeViewer(canvas, data.sensors, data.poses, say);
+  const viewer = makeViewer(canvas, data.sensors, data.poses, say, data.is_played);
   const isFree = (colour) => !document.querySelector("[data-colour=" + colour + "]").disabled;
   if (data.sensors.length > 1 && isFree("lidar")) colouring = "lidar";
 

@@ -99,6 +99,7 @@ def _page(title: str, first: Scan, total: int | None) -> bytes:
         # The head of a run is partial.
         "begin": int(first.index < 0 and (total or 0) > 1),
         "ahead": _AHEAD,
+        "is_played": True,
         "play_ms": float(1000 / (parse_rate(first.rate_hz) * first.slices)),
         "total": total,
     }

@@ -107,10 +107,17 @@ const VERTEX = `attribute vec3 place; attribute vec4 colour; uniform mat4 clip; 
 const FRAGMENT = `precision mediump float; varying vec3 shade;
   void main() { gl_FragColor = vec4(shade, 1.0); }`;
 
-// Draw with WebGL; null where there is none.
-function glPainter(canvas) {
+// Whether WebGL is done on the processor; browsers do not all tell by failIfMajorPerformanceCaveat.
+function isSoftware(gl) {
+  const info = gl.getExtension("WEBGL_debug_renderer_info");
+  const name = gl.getParameter(info ? info.UNMASKED_RENDERER_WEBGL : gl.RENDERER);
+  return /SwiftShader|llvmpipe|softpipe|Basic Render/.test(name);
+}
+
+// Draw with WebGL; null where there is none, isFast: also where it is done on the processor.
+function glPainter(canvas, isFast) {
   const gl = canvas.getContext("webgl", { preserveDrawingBuffer: true, antialias: false });
-  if (!gl) return null;
+  if (!gl || (isFast && isSoftware(gl))) return null;
   const program = gl.createProgram();
   for (const [kind, text] of [[gl.VERTEX_SHADER, VERTEX], [gl.FRAGMENT_SHADER, FRAGMENT]]) {
     const shader = gl.createShader(kind);
@@ -284,8 +291,10 @@ class Camera {
 // -- viewer -------------------------------------------------------------------------------------
 
 // Let a canvas show scans. names, poses: of the lidars; say: called with the reason when points are
-// drawn without WebGL. Gives an object with `show(cloud, colouring)`, `fit()`, `above()`, `draw()`.
-function makeViewer(canvas, names, poses, say) {
+// drawn without WebGL; isPlayed: many scans per second, which the processor draws several times
+// faster without WebGL. Gives an object with `show(cloud, colouring)`, `fit()`, `above()` and
+// `draw()`.
+function makeViewer(canvas, names, poses, say, isPlayed) {
   const camera = new Camera();
   let base = null, paint = null;
   let cloud = null, colouring = "height", colours = null;
@@ -296,7 +305,7 @@ function makeViewer(canvas, names, poses, say) {
     base = document.createElement("canvas");
     base.setAttribute("aria-hidden", "true");
     canvas.before(base);
-    paint = withGl ? glPainter(base) : null;
+    paint = withGl ? glPainter(base, !!isPlayed) : null;
     if (paint) {
       base.addEventListener("webglcontextlost", () => { begin(false); draw(); });
       return;
@@ -304,8 +313,8 @@ function makeViewer(canvas, names, poses, say) {
     // A canvas that was asked for WebGL gives nothing else.
     if (withGl) { begin(false); return; }
     paint = plainPainter(base);
-    say("This browser offers no WebGL, so the points are drawn on the processor: slower, and " +
-      "without fading by distance.");
+    say("This browser offers no WebGL" + (isPlayed ? " with a graphics processor" : "") +
+      ", so the points are drawn on the processor: slower, and without fading by distance.");
   }
 
   function drawNow() {
