@@ -6,7 +6,7 @@ is z, upward, unless the name of the body frame ends as ROS says of others (REP 
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 
 import numpy as np
 
@@ -53,15 +53,21 @@ def vertical_of(body_frame: str) -> tuple[float, float, float]:
 
 
 def ups(
-    sampler: Sampler, router: Router, sensors: Sequence[DetectedSensor]
+    sampler: Sampler,
+    router: Router,
+    sensors: Sequence[DetectedSensor],
+    mean: Callable[[Sequence[ImuSamples]], F64Array | None] = mean_gravity,
 ) -> Iterator[tuple[DetectedSensor, F64Array]]:
-    """Sensors with pose and IMU, and up (3,) by its gravity in the first seconds, body frame."""
+    """Sensors with pose and IMU, and up (3,) by its gravity in the first seconds, body frame.
+
+    mean: of the samples, IMU frame.
+    """
     for number, sensor in enumerate(sensors):
         sensor_from_imu = sensor.lidar.sensor_from_imu() if sensor.pose.is_known else None
         parts = list(_samples(sampler, router, number, sensor))
         if sensor_from_imu is None or not parts:
             continue
-        gravity = mean_gravity(parts)
+        gravity = mean(parts)
         if gravity is not None:
             up = sensor.pose.body_from_sensor[:3, :3] @ sensor_from_imu[:3, :3] @ gravity
             yield sensor, up / np.linalg.norm(up)

@@ -15,7 +15,7 @@ from mlbatch.discovery.discover import Discovery
 from mlbatch.discovery.gravity import ups, vertical_of
 from mlbatch.errors import ExportError, NoScanError, RecordingError, RigError, UsageError
 from mlbatch.frames.transforms import compose, inverse, rpy_deg
-from mlbatch.motion.gravity import tilt_deg
+from mlbatch.motion.gravity import standing_gravity, tilt_deg
 from mlbatch.motion.registration import Pose
 from mlbatch.motion.se3 import exp_rotation
 from mlbatch.pipeline.conversion import Conversion, Progress
@@ -44,7 +44,7 @@ from mlbatch.writers import check_name
 
 # Windows in which a machine moves evenly, Hz.
 _RATE = 10
-# The ground is rarely more level, and a moving IMU feels more than gravity.
+# The ground is rarely more level.
 _LEVEL_DEG = 2.0
 
 
@@ -125,7 +125,7 @@ def calibrate(
 def _level(setup: Discovery, first: str) -> str:
     """What the IMU of the first lidar says of its pose, which is taken as it is."""
     vertical = vertical_of(setup.frame_id)
-    for sensor, up in ups(setup.sampler, setup.router, setup.sensors):
+    for sensor, up in ups(setup.sampler, setup.router, setup.sensors, standing_gravity):
         tilted_deg = tilt_deg(up, np.array(vertical))
         if sensor.name != first or tilted_deg < _LEVEL_DEG:
             continue
@@ -137,7 +137,7 @@ def _level(setup: Discovery, first: str) -> str:
         return (
             f"{first}: its IMU finds the vertical {tilted_deg:.1f} degrees off with this pose, "
             "which all others are relative to; where the machine stood level in the first "
-            f"seconds, rotation_rpy_deg: [{angles}] makes it level"
+            f"second, rotation_rpy_deg: [{angles}] makes it level"
         )
     return ""
 

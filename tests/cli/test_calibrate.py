@@ -108,8 +108,14 @@ def test_mistakes(shell: Shell, name: str) -> None:
 
 
 def test_the_imu_of_the_first_lidar_says_that_it_is_not_level(shell: Shell) -> None:
-    """The guess lacks its pitch of 10 degrees; the trolley stands at first."""
-    text = GUESS.replace("EXTRINSICS", ROUGH).replace("[0, 10, 80]", "[0, 0, 80]")
+    """Both poses are tilted by 10 degrees about y of the body; the trolley stands at first."""
+    cosine, sine = np.cos(np.deg2rad(10.0)), np.sin(np.deg2rad(10.0))
+    tilt = np.array([[cosine, 0, sine, 0], [0, 1, 0, 0], [-sine, 0, cosine, 0], [0, 0, 0, 1]])
+    text = GUESS.replace("{translation_m: [0.1, 0.3, 0.6], rotation_rpy_deg: [0, 10, 80]}", "LEFT")
+    for word, sensor in zip(("LEFT", "EXTRINSICS"), read_rig(TRUE).sensors, strict=True):
+        assert isinstance(sensor.extrinsics, np.ndarray)
+        rows = (tilt @ sensor.extrinsics).tolist()
+        text = text.replace(word, f"{{matrix: {rows}}}")
     Path("guess.yaml").write_text(text, encoding="utf-8")
     outcome = shell(f"calibrate {DRIVE} --rig guess.yaml --json")
     assert outcome.code == 0
@@ -118,8 +124,8 @@ def test_the_imu_of_the_first_lidar_says_that_it_is_not_level(shell: Shell) -> N
         json.loads(outcome.out)["level"],
     )
     assert found
-    assert float(found[1]) == pytest.approx(10.0, abs=1.5)
-    # The trolley sways by 1 degree at most, its IMU is off by 0.3.
-    assert [float(angle) for angle in found[2].split(",")] == pytest.approx([0, 10, 80], abs=1.5)
+    assert float(found[1]) == pytest.approx(10.0, abs=0.5)
+    # Its IMU is off by 0.3 degrees.
+    assert [float(angle) for angle in found[2].split(",")] == pytest.approx([0, 10, 80], abs=0.5)
     _guess()
     assert json.loads(shell(f"calibrate {DRIVE} --rig guess.yaml --json").out)["level"] == ""
