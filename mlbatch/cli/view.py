@@ -18,6 +18,7 @@ from mlbatch.errors import UsageError, one_line
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
+    from mlbatch.discovery.types import Note
     from mlbatch.outputs.scan import Scan
 
 # Of `convert`: what selects lidars, times and points.
@@ -95,7 +96,15 @@ def _source(
     defaults = {option.name: option.default for option in options.CONVERT}
     given = {"pass_": None, "no_pose_check": True} | values
     job = job_of(paths, defaults | given)
-    return lambda: scans_of(job), None
+    said: set[Note] = set()
+
+    def warn(note: Note) -> None:
+        # Scans are made anew to go back.
+        if note not in said:
+            typer.echo(one_line(f"mlbatch: warning: {note.code}: {note.message}"), err=True)
+        said.add(note)
+
+    return lambda: scans_of(job, warn), None
 
 
 def _windows_of(table: str) -> int:

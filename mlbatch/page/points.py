@@ -102,8 +102,9 @@ def joined_cloud(
     times = [part.time_ns for part in parts if part.time_ns is not None]
     rings = [part.ring for part in parts if part.ring is not None]
     bright = [part.intensity for part in parts if part.intensity is not None]
-    first_ns = min(0, *(int(one.min(initial=0)) for one in times))
-    last_ns = max(window_ns, *(int(one.max(initial=0)) for one in times))
+    # Some outputs have no times.
+    first_ns = min([0, *(int(one.min(initial=0)) for one in times)])
+    last_ns = max([window_ns, *(int(one.max(initial=0)) for one in times)])
     has_lidar = len(lidars) == len(parts)
     has_time = len(times) == len(parts)
     has_ring = len(rings) == len(parts)

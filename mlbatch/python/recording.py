@@ -6,7 +6,7 @@ Everything is read when it is asked for. Each iterator is a pass of its own over
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from operator import index as whole_number
 from pathlib import Path
@@ -18,6 +18,7 @@ from mlbatch.arrays import F64Array
 from mlbatch.batching.grid import Grid
 from mlbatch.batching.windows import Limit
 from mlbatch.discovery.discover import Discovery, discover
+from mlbatch.discovery.types import Note
 from mlbatch.errors import NoScanError, RecordingError, UsageError
 from mlbatch.native import require_library
 from mlbatch.outputs.scan import Scan
@@ -295,17 +296,23 @@ class Recording:
         return replace(self.job, selection=selection)
 
 
-def scans_of(job: Job) -> Iterator[Scan]:
-    """Yield the scans of a job, each with arrays of its own; the first 10 s are read at once."""
-    return _copied(Conversion(job))
+def scans_of(job: Job, warn: Callable[[Note], None] | None = None) -> Iterator[Scan]:
+    """Yield the scans of a job, each with arrays of its own; the first 10 s are read at once.
+
+    warn: called with each warning, after the last scan.
+    """
+    return _copied(Conversion(job), warn)
 
 
-def _copied(run: Conversion) -> Iterator[Scan]:
+def _copied(run: Conversion, warn: Callable[[Note], None] | None) -> Iterator[Scan]:
     for scan, only in run.scans():
         found = Scan.copied(scan)
         if only is not None:
             found.sensor = found.sensors[only]
         yield found
+    if warn is not None:
+        for note in run.notes:
+            warn(note)
 
 
 def _last_of(job: Job) -> Scan | None:

@@ -41,6 +41,7 @@ OUTPUTS = {
     "npz": ("s", ()),
     "split": ("s", ("--split",)),
     "bag": ("s.bag", ()),
+    "kitti": ("s", ("-f", "kitti")),
 }
 
 
@@ -137,6 +138,12 @@ def test_scans_of_an_output(case: str, tmp_path: Path) -> None:
             if case == "split":
                 left, right = scans[2 * number : 2 * number + 2]
                 assert shown["shown"] == left.point_count + right.point_count
+            elif case == "kitti":
+                # Neither lidars nor times, which `same` compares.
+                assert shown["has"] == {"lidar": False, "time": False, "ring": False}
+                xyz = np.sort(scans[number].xyz, axis=0)
+                found = np.sort(points_of(shown).xyz, axis=0)
+                assert np.abs(found - xyz).max() <= 0.5 * shown["step"] + 1e-5
             else:
                 same(shown, scans[number])
         assert fetched(server, SCANS)["total"] == SCANS
@@ -250,6 +257,25 @@ def test_ctrl_c_ends(number: signal.Signals, tmp_path: Path) -> None:
         process.send_signal(number)
         _, err = process.communicate()
         assert (process.returncode, err) == (0, "")
+
+
+def test_warnings_come_after_the_last_scan(tmp_path: Path) -> None:
+    capture = tmp_path / "cut.pcap"
+    capture.write_bytes(CAPTURE.read_bytes()[:-100])
+    command = [sys.executable, "-m", "mlbatch", "view", str(capture), "-r", str(RIG)]
+    with subprocess.Popen(
+        [*command, "--no-browser"], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    ) as process:
+        assert process.stdout is not None
+        url = process.stdout.readline().split()[0]
+        # Twice from the beginning on.
+        for number in (1000, 0, 1000):
+            with urllib.request.urlopen(f"{url}scans/{number}") as answer:
+                answer.read()
+        process.send_signal(signal.SIGINT)
+        _, err = process.communicate()
+    assert process.returncode == 0
+    assert err.count("mlbatch: warning: cut_off: ") == 1
 
 
 @pytest.mark.parametrize(
