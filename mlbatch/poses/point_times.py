@@ -389,11 +389,13 @@ def _solved(pair: _Pair, late_s: float, as_read: _Agreement) -> tuple[DelayFit, 
     sigma_s = float(np.hypot(solution.sigma_s, _FLOOR_S))
     solved = _Agreement(pair.places(late_s, every), state, _CLOSE_M)
     reason, verdict = "", FITS if abs(late_s) <= _SIGMAS * sigma_s else DIFFERS
+    # Of times that fit, surfaces agree as well either way.
+    is_worse = verdict == DIFFERS and solved.total < as_read.total
     if solved.shared < _FEWEST_SHARED * len(every):
         reason, late_s, sigma_s = "they see too little in common", 0.0, 0.0
     elif (np.abs(pose_off(state.corrections[1])) > _MOST_POSE_SIGMAS * _POSE_SIGMA).any():
         reason = "their poses do not fit"
-    elif abs(change_s) > sigma_s or sigma_s > _MOST_SIGMA_S or solved.total < as_read.total:
+    elif abs(change_s) > sigma_s or sigma_s > _MOST_SIGMA_S or is_worse:
         reason = "motion and what both see do not determine it"
     residual_m = as_read.residual_m, solved.residual_m
     fit = DelayFit(OPEN if reason else verdict, reason, late_s, sigma_s, residual_m)
