@@ -101,7 +101,7 @@ def scenario(seed: int, *, moving: bool = True, duration_s: float = 4.0) -> str:
         at = at + step * np.array([np.cos(heading), np.sin(heading)])
     track = np.array(places)
     middle = track[: int(duration_s) + 2].mean(axis=0)
-    boxes = []
+    boxes: list[str] = []
     while len(boxes) < 24:
         centre = middle + rng.uniform(-38.0, 38.0, 2)
         size = rng.uniform([1.5, 1.5, 1.5], [10.0, 8.0, 7.0])

@@ -130,7 +130,7 @@ def make(folder: Path, scene: str, rig: int) -> None:
     work.mkdir(parents=True, exist_ok=True)
     (work / "scenario.yaml").write_text(yaml.safe_dump(scenario(scene, rig)))
     recording = work / "rec.mcap"
-    write_recording(read_scenario(work / "scenario.yaml"), recording, overwrite=True)
+    write_recording(read_scenario(str(work / "scenario.yaml")), recording, overwrite=True)
     stored: dict[str, F64Array] = {}
     windows = 0
     scans = mlbatch.scans(recording, rig=work / "rec.rig.yaml", min_range=1.5)
@@ -144,7 +144,8 @@ def make(folder: Path, scene: str, rig: int) -> None:
             time_ns = scan.start_ns + scan.time_ns[rows].astype(np.int64)
             stored[f"time_{name}"] = time_ns
         stored[f"window_{windows - 1}"] = np.array([scan.start_ns, scan.end_ns])
-    np.savez(target, windows=windows, **stored)
+    stored["windows"] = np.array(windows)
+    np.savez(target, allow_pickle=False, **stored)
     recording.unlink()
     print(target.name, windows, flush=True)
 
@@ -200,7 +201,9 @@ def guesses(
                         cloud.lidar,
                         _moved(cloud.points_m, wrong[cloud.lidar]),
                         cloud.time_s,
-                        _moved(cloud.origin_m, wrong[cloud.lidar]),
+                        None
+                        if cloud.origin_m is None
+                        else _moved(cloud.origin_m, wrong[cloud.lidar]),
                     )
                     for cloud in place
                 ]

@@ -24,7 +24,6 @@ from mlbatch.poses.from_motion import (
     poses_from_motion,
 )
 from mlbatch.rig.rig import read_rig
-from mlbatch.types import Scan
 
 # What is required of a pose that is not refused, mm and degrees.
 MOST_MM, MOST_DEG = 20.0, 0.1
@@ -49,7 +48,7 @@ def windows_of(
         yield MotionWindow(scan.start_ns, scan.end_ns, clouds)
 
 
-def _poses(scan: Scan, turns: list[F64Array]) -> Iterator[F64Array]:
+def _poses(scan: mlbatch.Scan, turns: list[F64Array]) -> Iterator[F64Array]:
     for sensor, turn in zip(scan.info.sensors, turns, strict=True):
         pose = np.array(sensor.body_from_sensor, np.float64)
         pose[:3, :3] = pose[:3, :3] @ turn

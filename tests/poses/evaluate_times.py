@@ -47,7 +47,8 @@ def verdict(reading: Reading, findings: Sequence[TimeFinding]) -> str:
     found = keys.get(key)
     if len(keys) != 1 or found is None:
         return "wrong"
-    return "right" if abs(float(found[len("{offset_s:") : -1]) - value) < _OFFSET_S else "wrong"
+    late_s = float(found[len("{offset_s:") : -1]) - float(str(value))
+    return "right" if abs(late_s) < _OFFSET_S else "wrong"
 
 
 def main() -> None:

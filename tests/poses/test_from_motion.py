@@ -52,7 +52,9 @@ def seen_by(body: F64Array, pose: Pose) -> F64Array:
 def noisy(twists: F64Array, seed: int) -> F64Array:
     """Errors of poses, which the next step takes back."""
     draw = np.random.default_rng(seed).normal(size=(STEPS + 1, 6))
-    return twists + np.diff(draw, axis=0) * np.array([SIGMA_M] * 3 + [SIGMA_RAD] * 3)
+    sigma: F64Array = np.repeat([SIGMA_M, SIGMA_RAD], 3)
+    found: F64Array = twists + np.diff(draw, axis=0) * sigma
+    return found
 
 
 def mountings(seed: int) -> tuple[Pose, Pose]:

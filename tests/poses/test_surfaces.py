@@ -14,7 +14,8 @@ def patch(rng: np.random.Generator, normal: F64Array, noise_m: float, count: int
     """Points around (0.5, 0.5, 0.5) on a plane, in the middle of a cell of 1 m."""
     across = np.linalg.svd(normal[None])[2][1:]
     flat = rng.uniform(-0.4, 0.4, (count, 2)) @ across
-    return flat + 0.5 + noise_m * rng.standard_normal((count, 1)) * normal
+    found: F64Array = flat + 0.5 + noise_m * rng.standard_normal((count, 1)) * normal
+    return found
 
 
 def test_a_plane_has_the_normal_of_its_points_and_the_variance_of_their_mean() -> None:

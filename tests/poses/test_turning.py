@@ -11,6 +11,7 @@ from mlbatch.arrays import F64Array, I64Array
 from mlbatch.motion.agreement import Turns
 from mlbatch.motion.se3 import exp_rotation, log_rotation
 from mlbatch.poses.turning import gyroscope_turns, lidar_turns, turning
+from mlbatch.units import NS_PER_S
 
 MIDDLE_NS = np.arange(200, dtype=np.int64) * 100_000_000 + 2_000_000_000
 BIAS = np.array([0.01, -0.004, 0.006])
@@ -29,11 +30,12 @@ def seen_and_felt(
     axes: int, rotation: F64Array, late_ns: int, noise_rad: float = 3e-4
 ) -> tuple[F64Array, Turns]:
     """Turns seen by a lidar between windows, and those of a gyroscope, 100 Hz."""
-    total = turned(MIDDLE_NS * 1e-9, axes)
+    total = turned(MIDDLE_NS / NS_PER_S, axes)
     draw = np.random.default_rng(3).normal(size=total.shape) * noise_rad
     seen = np.diff(total + draw, axis=0, prepend=np.nan)
     stamp_ns: I64Array = np.arange(2400, dtype=np.int64) * 10_000_000
-    felt = turned(stamp_ns * 1e-9, axes) @ rotation + BIAS * (stamp_ns * 1e-9)[:, None]
+    time_s: F64Array = stamp_ns / NS_PER_S
+    felt = turned(time_s, axes) @ rotation + BIAS * time_s[:, None]
     return seen, Turns(stamp_ns + late_ns, felt)
 
 
@@ -79,7 +81,7 @@ def test_the_clock_of_another_lidar(late_s: float) -> None:
     rotation = exp_rotation(np.array([[0.3, -0.2, 1.0]]))[0]
     seen, _ = seen_and_felt(2, np.eye(3), 0)
     # What happens at a time has a stamp that is late.
-    total = turned(MIDDLE_NS * 1e-9 - late_s, 2) @ rotation
+    total = turned(MIDDLE_NS / NS_PER_S - late_s, 2) @ rotation
     draw = np.random.default_rng(5).normal(size=total.shape) * 3e-4
     other = np.diff(total + draw, axis=0, prepend=np.nan)
     other[60:63] = np.nan
