@@ -45,6 +45,8 @@ def test_no_other_path_may_be_it(
     outcome = shell(command, *words)
     assert (outcome.code, outcome.out) == (2, "")
     name = option.upper() if is_argument else option
+    if command == "view" and is_argument:
+        name = "OUTPUT|RECORDING..."
     assert outcome.err == (
         f"mlbatch: error: {name}: expected a path, found -: neither standard input nor standard "
         "output can be used here; give a file or folder\n"

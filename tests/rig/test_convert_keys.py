@@ -17,7 +17,16 @@ from tests.contract.test_help import OPTIONS
 SENSORS = "sensors: [{name: a}]\n"
 # Options of one run, and those that the rig has a key for.
 NOT_IN_A_RIG = {
-    *("--rig", "--output", "--report", "--html", "--dry-run", "--resume", "--overwrite"),
+    *(
+        "--rig",
+        "--output",
+        "--report",
+        "--html",
+        "--html-scans",
+        "--dry-run",
+        "--resume",
+        "--overwrite",
+    ),
     "--shard",
     *("--rate", "--metadata", "--exclude-box"),
 }
