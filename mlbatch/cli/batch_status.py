@@ -8,13 +8,15 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from mlbatch.cli.parameters import AsJson
+
 if TYPE_CHECKING:
     from mlbatch.batch.status import BatchStatus
 
 
 def batch_status(
     output: Annotated[str, typer.Argument(help="Output of mlbatch batch: a folder, or a URL.")],
-    as_json: Annotated[bool, typer.Option("--json", help="Print JSON, for programs.")] = False,
+    as_json: AsJson = False,
     page: Annotated[
         Path | None, typer.Option(help="Write a page (HTML) of all sessions.", metavar="FILE")
     ] = None,

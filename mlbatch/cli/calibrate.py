@@ -10,19 +10,12 @@ from typing import Annotated
 
 import typer
 
-from mlbatch.cli.parameters import one_of
+from mlbatch.cli.parameters import AsJson, Clock, Metadata, Recordings, Verbose
 from mlbatch.errors import one_line
-from mlbatch.options import CLOCKS
 
 
 def calibrate(
-    recordings: Annotated[
-        list[Path],
-        typer.Argument(
-            help="Recordings of one session: pcap, pcapng, MCAP, ROS bags; folders of them; "
-            "patterns in quotes ('*.pcap')."
-        ),
-    ],
+    recordings: Recordings,
     rig: Annotated[
         Path,
         typer.Option(
@@ -35,24 +28,12 @@ def calibrate(
         Path | None,
         typer.Option("-o", "--output", help="Rig file to write.  [default: none]", metavar="FILE"),
     ] = None,
-    metadata: Annotated[
-        list[Path] | None,
-        typer.Option(
-            *("--metadata", "-m"),
-            help="Metadata or calibration; repeatable.  [default: next to RECORDING]",
-            metavar="FILE",
-        ),
-    ] = None,
+    metadata: Metadata = None,
     only: Annotated[
         list[str] | None,
         typer.Option(help="Only this sensor, by name or serial; repeatable.", metavar="SENSOR"),
     ] = None,
-    clock: Annotated[
-        str,
-        one_of(
-            CLOCKS, "--clock", help="sensor: timestamps of the packets; host: their receive times."
-        ),
-    ] = "sensor",
+    clock: Clock = "sensor",
     align_clocks: Annotated[
         bool, typer.Option("--align-clocks", help="Align clocks that are not synchronised.")
     ] = False,
@@ -80,13 +61,8 @@ def calibrate(
     overwrite: Annotated[
         bool, typer.Option("--overwrite", help="Replace an existing rig file and page.")
     ] = False,
-    as_json: Annotated[bool, typer.Option("--json", help="Print JSON, for programs.")] = False,
-    verbose: Annotated[
-        bool,
-        typer.Option(
-            "--verbose", "-v", help="Print progress once a minute if stderr is no terminal."
-        ),
-    ] = False,
+    as_json: AsJson = False,
+    verbose: Verbose = False,
 ) -> None:
     """Refine the poses of a rig's lidars by the surfaces that they share."""
     from mlbatch.api import run_calibration

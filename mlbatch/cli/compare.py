@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from mlbatch.cli.parameters import is_stdout, one_of
+from mlbatch.cli.parameters import AsJson, Clock, Metadata, Recordings, Verbose, is_stdout
 from mlbatch.errors import UsageError, one_line
 from mlbatch.options import CLOCKS
 from mlbatch.units import NS_PER_S
@@ -22,13 +22,7 @@ if TYPE_CHECKING:
 
 
 def compare(
-    recordings: Annotated[
-        list[Path],
-        typer.Argument(
-            help="Recordings of one session: pcap, pcapng, MCAP, ROS bags; folders of them; "
-            "patterns in quotes ('*.pcap')."
-        ),
-    ],
+    recordings: Recordings,
     rig: Annotated[
         Path | None, typer.Option("--rig", "-r", help="Rig file (YAML).", metavar="FILE")
     ] = None,
@@ -38,20 +32,8 @@ def compare(
             help="Windows per second, Hz: 10, 29.97.  [default: rig's, or 10]", metavar="HZ"
         ),
     ] = None,
-    metadata: Annotated[
-        list[Path] | None,
-        typer.Option(
-            *("--metadata", "-m"),
-            help="Metadata or calibration; repeatable.  [default: next to RECORDING]",
-            metavar="FILE",
-        ),
-    ] = None,
-    clock: Annotated[
-        str,
-        one_of(
-            CLOCKS, "--clock", help="sensor: timestamps of the packets; host: their receive times."
-        ),
-    ] = "sensor",
+    metadata: Metadata = None,
+    clock: Clock = "sensor",
     tolerance: Annotated[
         str,
         typer.Option(
@@ -75,13 +57,8 @@ def compare(
     overwrite: Annotated[
         bool, typer.Option("--overwrite", help="Replace an existing page and figures.")
     ] = False,
-    as_json: Annotated[bool, typer.Option("--json", help="Print JSON, for programs.")] = False,
-    verbose: Annotated[
-        bool,
-        typer.Option(
-            "--verbose", "-v", help="Print progress once a minute if stderr is no terminal."
-        ),
-    ] = False,
+    as_json: AsJson = False,
+    verbose: Verbose = False,
 ) -> None:
     """Compare frame-level fusion of lidars with windows: time spans, columns, stale data."""
     from mlbatch.cli.progress import progress_bar

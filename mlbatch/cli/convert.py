@@ -1,23 +1,16 @@
 """`mlbatch convert`: the main job."""
 
 import sys
-from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import typer
 
 from mlbatch import options
-from mlbatch.cli.parameters import parameter, with_parameters
+from mlbatch.cli.parameters import Recordings, parameter, with_parameters
 
 
 def convert(
-    recordings: Annotated[
-        list[Path],
-        typer.Argument(
-            help="Recordings of one session: pcap, pcapng, MCAP, ROS bags; folders of them; "
-            "patterns in quotes ('*.pcap')."
-        ),
-    ],
+    recordings: Recordings,
     **values: Any,
 ) -> None:
     """Turn raw lidar packets into merged scans at an exact rate."""

@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from mlbatch.cli.parameters import AsJson
+
 if TYPE_CHECKING:
     from mlbatch.digests.diff import FieldDifference, OutputDiff
 
@@ -22,7 +24,7 @@ def diff(
     tolerance: Annotated[
         float, typer.Option(help="Of reals (coordinates and ranges in m, intensities).")
     ] = 0.0,
-    as_json: Annotated[bool, typer.Option("--json", help="Print JSON, for programs.")] = False,
+    as_json: AsJson = False,
 ) -> None:
     """Compare two outputs: first differing scan, field and point, and by how much; exit 1."""
     from mlbatch.batch.remote import local_output

@@ -7,17 +7,12 @@ from typing import Annotated
 
 import typer
 
+from mlbatch.cli.parameters import Metadata, Recordings, Verbose
 from mlbatch.errors import one_line
 
 
 def extract(
-    recordings: Annotated[
-        list[Path],
-        typer.Argument(
-            help="Recordings of one session: pcap, pcapng, MCAP, ROS bags; folders of them; "
-            "patterns in quotes ('*.pcap')."
-        ),
-    ],
+    recordings: Recordings,
     output: Annotated[
         Path,
         typer.Option("-o", "--output", help="Recording to write: .pcap, .mcap, .db3 or .bag."),
@@ -28,14 +23,7 @@ def extract(
             "--rig", "-r", help="Rig file (YAML); one for the output is written.", metavar="FILE"
         ),
     ] = None,
-    metadata: Annotated[
-        list[Path] | None,
-        typer.Option(
-            *("--metadata", "-m"),
-            help="Metadata or calibration; repeatable.  [default: next to RECORDING]",
-            metavar="FILE",
-        ),
-    ] = None,
+    metadata: Metadata = None,
     only: Annotated[
         list[str] | None,
         typer.Option(
@@ -72,12 +60,7 @@ def extract(
     ] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace existing files.")] = False,
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No counts, no progress.")] = False,
-    verbose: Annotated[
-        bool,
-        typer.Option(
-            "--verbose", "-v", help="Print progress once a minute if stderr is no terminal."
-        ),
-    ] = False,
+    verbose: Verbose = False,
 ) -> None:
     """Extract raw packets of lidars and times, unchanged, into another container."""
     from mlbatch.cli.progress import progress_bar

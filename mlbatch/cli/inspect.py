@@ -8,25 +8,13 @@ from typing import Annotated
 
 import typer
 
+from mlbatch.cli.parameters import AsJson, Metadata, Recordings, Verbose
 from mlbatch.errors import one_line
 
 
 def inspect(
-    recordings: Annotated[
-        list[Path],
-        typer.Argument(
-            help="Recordings of one session: pcap, pcapng, MCAP, ROS bags; folders of them; "
-            "patterns in quotes ('*.pcap')."
-        ),
-    ],
-    metadata: Annotated[
-        list[Path] | None,
-        typer.Option(
-            *("--metadata", "-m"),
-            help="Metadata or calibration; repeatable.  [default: next to RECORDING]",
-            metavar="FILE",
-        ),
-    ] = None,
+    recordings: Recordings,
+    metadata: Metadata = None,
     rig: Annotated[
         Path | None,
         typer.Option(
@@ -37,19 +25,14 @@ def inspect(
         bool,
         typer.Option("--whole", help="Packets, loss and clocks of the whole recording, not 10 s."),
     ] = False,
-    as_json: Annotated[bool, typer.Option("--json", help="Print JSON, for programs.")] = False,
+    as_json: AsJson = False,
     write_rig: Annotated[
         Path | None,
         typer.Option(
             help="Write a rig file that `convert` accepts; -: print only it.", metavar="FILE"
         ),
     ] = None,
-    verbose: Annotated[
-        bool,
-        typer.Option(
-            "--verbose", "-v", help="Print progress once a minute if stderr is no terminal."
-        ),
-    ] = False,
+    verbose: Verbose = False,
 ) -> None:
     """Show streams, sensors, modes, rates, loss, clocks and extrinsics (from the first 10 s)."""
     from mlbatch.cli.progress import progress_bar

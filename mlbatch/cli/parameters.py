@@ -6,7 +6,7 @@ import inspect
 import keyword
 from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, TypeAlias
 
 import typer
 
@@ -42,6 +42,36 @@ def one_of(words: Words, *names: str, help: str, metavar: str = "", **more: Any)
         return [word for word in look_up() if word.startswith(incomplete)]
 
     return typer.Option(*names, help=help, metavar=metavar, autocompletion=complete, **more)
+
+
+# Parameters of several commands, apart from the options of a conversion.
+Recordings: TypeAlias = Annotated[
+    list[Path],
+    typer.Argument(
+        help="Recordings of one session: pcap, pcapng, MCAP, ROS bags; folders of them; "
+        "patterns in quotes ('*.pcap')."
+    ),
+]
+Metadata: TypeAlias = Annotated[
+    list[Path] | None,
+    typer.Option(
+        *("--metadata", "-m"),
+        help="Metadata or calibration; repeatable.  [default: next to RECORDING]",
+        metavar="FILE",
+    ),
+]
+Clock: TypeAlias = Annotated[
+    str,
+    one_of(
+        *(options.CLOCKS, "--clock"),
+        help="sensor: timestamps of the packets; host: their receive times.",
+    ),
+]
+Verbose: TypeAlias = Annotated[
+    bool,
+    typer.Option("--verbose", "-v", help="Print progress once a minute if stderr is no terminal."),
+]
+AsJson: TypeAlias = Annotated[bool, typer.Option("--json", help="Print JSON, for programs.")]
 
 
 def _formats() -> Iterable[str]:

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import json
-from typing import Annotated
 
 import typer
+
+from mlbatch.cli.parameters import AsJson
 
 HEAD = ("model", "maker", "channels", "returns", "clock", "calibration", "verified")
 
 
 def sensors(
-    as_json: Annotated[bool, typer.Option("--json", help="Print JSON, for programs.")] = False,
+    as_json: AsJson = False,
 ) -> None:
     """List the supported lidars, what they need, and how each was verified."""
     from mlbatch.sensors import models

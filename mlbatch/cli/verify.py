@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from mlbatch.cli.parameters import AsJson, Verbose
+
 if TYPE_CHECKING:
     from mlbatch.verification import Verdict
 
@@ -23,13 +25,8 @@ def verify(
         Path | None,
         typer.Option(help="Report of the run (JSON). [default: in OUTPUT or next to it]"),
     ] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print JSON, for programs.")] = False,
-    verbose: Annotated[
-        bool,
-        typer.Option(
-            "--verbose", "-v", help="Print progress once a minute if stderr is no terminal."
-        ),
-    ] = False,
+    as_json: AsJson = False,
+    verbose: Verbose = False,
 ) -> None:
     """Check grid, order, times, counts and ledgers of an output, from the output alone."""
     from mlbatch.cli.progress import progress_bar

@@ -1,7 +1,7 @@
 """Whether the surfaces that two lidars see fit, with the poses of a run.
 
 Each place, two windows that follow each other, gives an estimate of the corrections that the poses
-need, with its covariance; those of all places are joined by their weights, and what they differ
+need, with its covariance; all are joined by their weights, and what they differ
 more than expected counts as uncertainty (Birge ratio). A residual is proven only where several
 places agree on it.
 """
@@ -210,7 +210,7 @@ class PoseComparison:
         return problem, solution
 
     def _count(self, surfaces: Sequence[Planes]) -> bool:
-        """Count the surfaces of the first window; return whether those of a pair do not fit."""
+        """Count the surfaces of the first window; return whether a pair's do not fit."""
         misfit = False
         for (one, other), pair in self._pairs.items():
             now = _Pair()

@@ -150,7 +150,6 @@ class Problem:
         self.lidars = lidars
         self.each = 7 if delays else 6
         self.poses = self.each * (lidars - 1)
-        self.unknowns = self.poses + 6 * len(places)
         self._stems: dict[tuple[int, int], Stems] = {}
 
     def clouds(self, place: int, state: State, edge_m: float) -> list[Planes]:

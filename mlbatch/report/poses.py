@@ -20,7 +20,7 @@ NOT_ASKED = "--no-pose-check"
 
 
 class PairFigures(NamedTuple):
-    """Two lidars; all figures are those of the directions that the scene determines.
+    """Two lidars; figures of the directions that the scene determines.
 
     lidars: their names; reason: why nothing is known, or ""; places: pairs of windows that were
     compared; surfaces: cells with a surface of both, in all places; overlap_percent: their share of

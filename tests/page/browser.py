@@ -109,7 +109,7 @@ class Browser:
         self.call("Page.removeScriptToEvaluateOnNewDocument", identifier=added["identifier"])
 
     def press(self, key: str, *, shift: bool = False) -> None:
-        """Press a key, as the page is told of it."""
+        """Press a key, as a browser does."""
         text = {"text": key} if len(key) == 1 else {}
         for kind in ("keyDown", "keyUp"):
             self.call("Input.dispatchKeyEvent", type=kind, key=key, modifiers=8 * shift, **text)
