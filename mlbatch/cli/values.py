@@ -73,19 +73,26 @@ def target_of(values: Mapping[str, Any]) -> Target:
         html=values["html"],
         html_scans=shown_scans(values["html_scans"]),
         split_jumps=on_jump == "split",
-        limits=_fail_on(values["fail_on"] or ()),
+        limits=_fail_on(values["fail_on"] or (), checks_poses=not values["no_pose_check"]),
         quiet=values["quiet"],
         verbose=values["verbose"],
     )
 
 
-def _fail_on(texts: Sequence[str]) -> tuple[Limit, ...]:
+def _fail_on(texts: Sequence[str], *, checks_poses: bool) -> tuple[Limit, ...]:
     if not texts:
         return ()
     # Not loaded without limits.
-    from mlbatch.report.limits import parse_limits
+    from mlbatch.report.limits import POSE, parse_limits
 
-    return parse_limits(texts)
+    limits = parse_limits(texts)
+    for limit in limits:
+        if limit.quantity == POSE and not checks_poses:
+            raise UsageError(
+                f"--fail-on: expected poses to be checked for {limit.text}, found --no-pose-check, "
+                "with which it could never fail; leave one out"
+            )
+    return limits
 
 
 def long_name(name: str) -> str:

@@ -14,9 +14,9 @@ from mlbatch.report.report import ACCEPTED_WARNINGS, CUT_OFF, RunReport
 # A part and the whole that it is a share of; 0: it is a share of nothing.
 Amount: TypeAlias = tuple[int, int]
 
-_LIMIT = r"\s*([a-z_]+)\s*>\s*(\d+(?:\.\d*)?|\.\d+)\s*(%|mm|cm|m|deg|)\s*"
+_LIMIT = r"\s*([a-z_]+)\s*>\s*(\d+(?:\.\d*)?|\.\d+)\s*(%|[a-z]*)\s*"
 # Of residuals of poses: in mm, or degrees.
-_POSE = "pose"
+POSE = "pose"
 _UNITS = {"mm": 1.0, "cm": 10.0, "m": 1000.0, "deg": 1.0}
 _EXAMPLE = "write loss>0.1%,underfilled>0"
 
@@ -31,7 +31,7 @@ class Limit(NamedTuple):
 
     def exceeded(self, report: RunReport) -> str:
         """Text that says how the limit is exceeded; "" if it is not."""
-        if self.quantity == _POSE:
+        if self.quantity == POSE:
             return self._exceeded_by_pose(report)
         quantity = _QUANTITIES[self.quantity]
         for owner, (part, whole) in quantity.amounts(report):
@@ -73,16 +73,16 @@ def _parsed(text: str) -> Limit:
             f"--fail-on: expected NAME>NUMBER or NAME>NUMBER%, found {text!r}; {_EXAMPLE}"
         )
     name, number, unit = found.groups()
-    if name == _POSE:
+    if name == POSE:
         if unit not in _UNITS:
             raise UsageError(
-                f"--fail-on: expected {_POSE}>NUMBER with mm, cm, m or deg, found "
-                f"{text.strip()!r}; write {_POSE}>5cm"
+                f"--fail-on: expected {POSE}>NUMBER with mm, cm, m or deg, found "
+                f"{text.strip()!r}; write {POSE}>5cm"
             )
         return Limit(text.strip(), name, float(number), unit)
     quantity = _QUANTITIES.get(name)
     if quantity is None:
-        known = ", ".join((*_QUANTITIES, _POSE))
+        known = ", ".join((*_QUANTITIES, POSE))
         raise UsageError(f"--fail-on: expected one of {known}, found {name!r}; {_EXAMPLE}")
     if unit and (unit != "%" or not quantity.is_share):
         raise UsageError(
