@@ -55,6 +55,12 @@ def target_of(values: Mapping[str, Any]) -> Target:
     output(values["output"], dry_run=values["dry_run"])
     report = values["report"]
     resume(values["resume"], dry_run=values["dry_run"])
+    html_scans = shown_scans(values["html_scans"])
+    if html_scans is not None and values["html"] is None:
+        raise UsageError(
+            "--html-scans: expected a page for the scans, found none; add --html FILE, or leave it "
+            "out"
+        )
     names = (
         *("output", "format", "point_layout", "compression", "ply_style", "dry_run"),
         *("overwrite", "resume"),
@@ -71,7 +77,7 @@ def target_of(values: Mapping[str, Any]) -> Target:
         request,
         prints_report=is_stdout(report),
         html=values["html"],
-        html_scans=shown_scans(values["html_scans"]),
+        html_scans=html_scans,
         split_jumps=on_jump == "split",
         limits=_fail_on(values["fail_on"] or (), checks_poses=not values["no_pose_check"]),
         quiet=values["quiet"],

@@ -148,6 +148,13 @@ def test_numbers_of_scans_are_checked(words: str, shell: Shell) -> None:
     assert not Path("scans").exists()
 
 
+def test_scans_without_a_page_are_refused(shell: Shell) -> None:
+    outcome = shell(f"convert {FIX} -o scans --html-scans 3")
+    assert outcome.code == 2
+    assert "--html-scans: expected a page for the scans, found none; add --html" in outcome.err
+    assert not Path("scans").exists()
+
+
 def test_large_scans_are_thinned_by_whole_columns(
     shell: Shell, monkeypatch: pytest.MonkeyPatch
 ) -> None:
