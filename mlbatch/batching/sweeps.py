@@ -15,6 +15,7 @@ import numpy as np
 
 from mlbatch.arrays import F64Array, I64Array
 from mlbatch.lidar.geometry import read_rotor_words
+from mlbatch.types import WindowColumns
 from mlbatch.units import NS_PER_MS
 
 # Lidars rotate at 5 Hz or faster: after a longer silence the rotor has passed zero.
@@ -122,6 +123,18 @@ class SweepCutter:
 def _extended(sweep: Sweep, stamp_ns: I64Array, ready_ns: int) -> Sweep:
     last_ns = int(stamp_ns[-1]) if len(stamp_ns) else sweep.last_ns
     return Sweep(sweep.sensor, sweep.first_ns, last_ns, ready_ns, sweep.columns + len(stamp_ns))
+
+
+def sweeps_of(columns: WindowColumns, sensors: int, ready_ns: int) -> SweepSet:
+    """The columns of each sensor in a window."""
+    parts: list[Sweep | None] = []
+    for index in range(sensors):
+        stamp_ns = columns.stamp_ns[columns.sensor == index]
+        part = None
+        if len(stamp_ns):
+            part = Sweep(index, int(stamp_ns[0]), int(stamp_ns[-1]), ready_ns, len(stamp_ns))
+        parts.append(part)
+    return tuple(parts)
 
 
 def publication_order(sweeps: Sequence[Sweep]) -> list[Sweep]:

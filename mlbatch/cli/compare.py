@@ -54,6 +54,14 @@ def compare(
             help="Also write figures for papers (PDF, PNG); needs the extra plot.", metavar="DIR"
         ),
     ] = None,
+    speed: Annotated[
+        str | None,
+        typer.Option(
+            help="Of an object on the page, m/s.  [default: 10]",
+            metavar="M/S",
+            show_default=False,
+        ),
+    ] = None,
     overwrite: Annotated[
         bool, typer.Option("--overwrite", help="Replace an existing page and figures.")
     ] = False,
@@ -66,15 +74,19 @@ def compare(
     from mlbatch.cli.values import rate as read_rate
     from mlbatch.compare.compare import Settings, compare
     from mlbatch.discovery.discover import SensorSelection
+    from mlbatch.page.policies import DEFAULT_MPS
     from mlbatch.pipeline.job import Job
     from mlbatch.python.options import choice
     from mlbatch.readers.inputs import expand
 
     choice("--clock", clock, CLOCKS)
     settings = Settings(
-        _duration_ns("--tolerance", tolerance),
-        _duration_ns("--timeout", timeout),
+        round(_above_0("--tolerance", tolerance, "seconds", "0.05") * NS_PER_S),
+        round(_above_0("--timeout", timeout, "seconds", "0.05") * NS_PER_S),
     )
+    speed_mps = DEFAULT_MPS if speed is None else _above_0("--speed", speed, "m/s", "10")
+    if speed is not None and html is None:
+        raise UsageError("--speed: expected a page to print it on, found none; add --html FILE")
     selection = SensorSelection(rig=rig, metadata=tuple(metadata or ()), host_clock=clock == "host")
     job = Job(expand(recordings), selection, rate=None if rate is None else read_rate(rate))
     prints_page = is_stdout(html)
@@ -91,12 +103,12 @@ def compare(
 
         check_figures(figures, overwrite=overwrite)
     with progress_bar("compare", is_verbose=verbose) as progress:
-        found = compare(job, settings, progress)
+        found = compare(job, settings, progress, finds_instant=html is not None)
     for note in found.notes:
         typer.echo(one_line(f"mlbatch: warning: {note.code}: {note.message}"), err=True)
     written = _write_figures(found, figures)
     if html is not None:
-        page = _page(found, job.recordings)
+        page = _page(found, job.recordings, speed_mps)
         if prints_page:
             typer.echo(page, nl=False)
             return
@@ -122,21 +134,21 @@ def _write_figures(found: Comparison, folder: Path | None) -> list[Path]:
     return write_figures(folder, found.figures())
 
 
-def _page(found: Comparison, recordings: Sequence[Path]) -> str:
+def _page(found: Comparison, recordings: Sequence[Path], speed_mps: float) -> str:
     from mlbatch.page.comparison import comparison_page
 
     title = ", ".join(path.name for path in recordings)
     notes = [f"{note.code}: {note.message}" for note in found.notes]
     command = shlex.join(["mlbatch", *sys.argv[1:]])
-    return comparison_page(title, found.title(), found.figures(), notes, command)
+    figures = found.figures()
+    return comparison_page(title, found.title(), figures, notes, command, found.instant, speed_mps)
 
 
-def _duration_ns(option: str, text: str) -> int:
-    """A duration in s, above 0."""
+def _above_0(option: str, text: str, unit: str, example: str) -> float:
     try:
-        seconds = float(text)
+        value = float(text)
     except ValueError:
-        seconds = math.nan
-    if not 0 < seconds < math.inf:
-        raise UsageError(f"{option}: expected seconds above 0, found {text!r}; write 0.05")
-    return round(seconds * NS_PER_S)
+        value = math.nan
+    if not 0 < value < math.inf:
+        raise UsageError(f"{option}: expected {unit} above 0, found {text!r}; write {example}")
+    return value

@@ -1,15 +1,15 @@
 """`mlbatch compare`: sets of joined sweeps against windows, from the same columns.
 
-Only timestamps and rotor positions are read. Columns are as in batching, from the window
-before its start (eq. 1) to the end, for all join policies.
+Only timestamps and rotor positions are read, and for a page the points of some instants. Columns
+are as in batching, from the window before its start (eq. 1) to the end, for all join policies.
 """
 
 from __future__ import annotations
 
 from array import array
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
-from typing import TypeAlias
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, TypeAlias
 
 from mlbatch.batching.batcher import SLACK_NS
 from mlbatch.batching.sweeps import (
@@ -19,10 +19,9 @@ from mlbatch.batching.sweeps import (
     JoinPolicy,
     NearestSweeps,
     NewestSweeps,
-    Sweep,
     SweepCutter,
-    SweepSet,
     publication_order,
+    sweeps_of,
 )
 from mlbatch.batching.windows import Window
 from mlbatch.compare.statistics import HEAD, Distribution, SetReport, SetStatistics
@@ -34,6 +33,10 @@ from mlbatch.pipeline.conversion import Conversion, Progress, sweep_cutter
 from mlbatch.pipeline.job import Job
 from mlbatch.pipeline.sensor import Sensor
 from mlbatch.units import NS_PER_MS, NS_PER_S, rate_text
+
+if TYPE_CHECKING:
+    from mlbatch.compare.instant import InstantFinder
+    from mlbatch.page.instant import SharedInstant
 
 SCHEMA = "mlbatch.compare/2"
 WINDOWS = "windows (mlbatch)"
@@ -81,6 +84,7 @@ class Comparison:
     sensors: tuple[SensorSweeps, ...]
     reports: tuple[SetReport, ...]
     notes: tuple[Note, ...] = ()
+    instant: SharedInstant | None = field(default=None, compare=False, repr=False)
 
     def rows(self) -> list[list[str]]:
         """The table, head first."""
@@ -135,8 +139,14 @@ class Joiner:
     """Cuts windows into sweeps, joins them by each policy, and measures the sets."""
 
     def __init__(
-        self, cutters: Sequence[SweepCutter], policies: Sequence[JoinPolicy], period_ns: int
+        self,
+        cutters: Sequence[SweepCutter],
+        policies: Sequence[JoinPolicy],
+        period_ns: int,
+        finder: InstantFinder | None = None,
     ) -> None:
+        """finder: takes the sets and windows, too."""
+        self._finder = finder
         self._cutters = list(cutters)
         self._policies = [
             (policy, SetStatistics(policy.name, len(cutters), period_ns)) for policy in policies
@@ -155,9 +165,13 @@ class Joiner:
         for sweep in publication_order(ended):
             self._columns += sweep.columns
             self.lengths_ns[sweep.sensor].append(sweep.ready_ns - sweep.first_ns)
-            for policy, statistics in self._policies:
+            for number, (policy, statistics) in enumerate(self._policies):
                 for joined in policy.publish(sweep):
                     statistics.add(joined, policy.ready_ns)
+                    if self._finder is not None:
+                        self._finder.add_set(number, joined)
+        if self._finder is not None:
+            self._finder.add(window)
 
     def reports(self) -> list[SetReport]:
         """Figures of each policy."""
@@ -168,14 +182,18 @@ class Joiner:
 
 
 def compare(
-    job: Job, settings: Settings | None = None, progress: Progress | None = None
+    job: Job,
+    settings: Settings | None = None,
+    progress: Progress | None = None,
+    *,
+    finds_instant: bool = False,
 ) -> Comparison:
     """Join the sweeps of a recording by each policy, and batch the same columns by windows.
 
-    progress: as of a conversion; its scans are windows.
+    progress: as of a conversion; its scans are windows; finds_instant: for the clouds of a page.
     """
     settings = settings or Settings()
-    # Extrinsics are not used. Partial windows are read: sweeps may begin or end in them.
+    # Times need no extrinsics. Partial windows are read: sweeps may begin or end in them.
     selection = replace(job.selection, identity_extrinsics=True)
     run = Conversion(replace(job, selection=selection, keep_partial=True))
     count = len(run.sensors)
@@ -190,9 +208,20 @@ def compare(
         NearestSweeps(count, settings.tolerance_ns),
         CollectedSweeps(count, settings.timeout_ns),
     )
-    joiner = Joiner([sweep_cutter(sensor) for sensor in run.sensors], policies, period_ns)
+    finder = None
+    if finds_instant:
+        # Not loaded for figures alone.
+        from mlbatch.compare.instant import InstantFinder
+
+        names = [*(policy.name for policy in policies), WINDOWS]
+        finder = InstantFinder(names, run.sensors, period_ns, run.plain_decoder)
+        run.users.append(finder)
+    cutters = [sweep_cutter(sensor) for sensor in run.sensors]
+    joiner = Joiner(cutters, policies, period_ns, finder)
     windows = SetStatistics(WINDOWS, count, period_ns)
     columns, length_ns = _run(run, joiner, windows, progress)
+    if finder is not None:
+        finder.finish()
     return Comparison(
         rate_hz=rate_text(run.grid.rate),
         period_ms=float(NS_PER_S / run.grid.rate / NS_PER_MS),
@@ -202,6 +231,7 @@ def compare(
         sensors=tuple(map(_sensor_sweeps, run.sensors, joiner.lengths_ns)),
         reports=(*joiner.reports(), windows.report(columns)),
         notes=tuple(run.notes),
+        instant=None if finder is None else finder.found(),
     )
 
 
@@ -226,7 +256,7 @@ def _run(
         end_ns = window.end_ns
         if previous is not None:
             ready_ns = previous.end_ns + SLACK_NS
-            statistics.add(_sweeps_of(previous, len(run.sensors)), ready_ns)
+            statistics.add(sweeps_of(previous.columns, len(run.sensors), previous.end_ns), ready_ns)
             columns += len(previous.columns)
         # Like `convert`: the head and the window of the last timestamp are not counted.
         previous = window if window.index >= 0 else None
@@ -235,19 +265,6 @@ def _run(
         raise RecordingError(run_report.why_no_scan(run))
     late = sum(dropped.get("late", 0) for dropped in run.batcher.dropped)
     return columns + late, end_ns - first_ns
-
-
-def _sweeps_of(window: Window, sensors: int) -> SweepSet:
-    """The columns of each sensor in a window."""
-    parts: list[Sweep | None] = []
-    for index in range(sensors):
-        stamp_ns = window.columns.stamp_ns[window.columns.sensor == index]
-        part = None
-        if len(stamp_ns):
-            first_ns = int(stamp_ns[0])
-            part = Sweep(index, first_ns, int(stamp_ns[-1]), window.end_ns, len(stamp_ns))
-        parts.append(part)
-    return tuple(parts)
 
 
 def _sensor_sweeps(sensor: Sensor, lengths_ns: array[int]) -> SensorSweeps:

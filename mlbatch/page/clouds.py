@@ -20,7 +20,7 @@ from mlbatch.page.points import PageCloud, Place, page_cloud
 from mlbatch.page.windows import Windows
 
 # Characters of the scans of a page; of scans that were asked for, what browsers open.
-_MOST_CHARS = 3_000_000
+MOST_CHARS = 3_000_000
 _MOST_CHARS_ASKED = 160_000_000
 # Of a point, where many are asked for.
 _CHARS_PER_POINT = 4
@@ -41,7 +41,7 @@ def chosen_clouds(output: Path, windows: Windows, scans: int | None) -> list[Pag
     places = choose_places(windows, _LEAST_SCANS if scans is None else scans)
     if scans is None:
         places = [place for place in places if place.title]
-    most = _MOST_CHARS if scans is None else _MOST_CHARS_ASKED
+    most = MOST_CHARS if scans is None else _MOST_CHARS_ASKED
     stride = 1
     if scans is not None:
         points = int(windows.points[[one.row for one in places]].sum())

@@ -1,6 +1,6 @@
-"""The page of a comparison: windows against frame-level fusion, as static HTML and SVG.
+"""The page of a comparison: windows against frame-level fusion, as clouds and static SVG.
 
-No script: the values of bars are titles of their elements, which browsers show.
+The values of bars are titles of their elements, which browsers show.
 """
 
 from __future__ import annotations
@@ -11,8 +11,26 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from mlbatch.arrays import F64Array
-from mlbatch.page.policies import SPEEDS_KMH, PolicyFigures, offset_m, quantile
-from mlbatch.page.templates import Verdict, render
+from mlbatch.page.document import COLOURS
+from mlbatch.page.instant import HEAD as INSTANT_HEAD
+from mlbatch.page.instant import (
+    SharedInstant,
+    about,
+    ages_plot,
+    direction_plots,
+    place_words,
+    toggle,
+)
+from mlbatch.page.instant import rows as instant_rows
+from mlbatch.page.policies import (
+    DEFAULT_MPS,
+    KMH_PER_MPS,
+    SPEEDS_KMH,
+    PolicyFigures,
+    offset_m,
+    quantile,
+)
+from mlbatch.page.templates import Verdict, asset, page_json, render
 
 _WIDTH = 900
 _HEIGHT = 300
@@ -37,15 +55,41 @@ Policies = Sequence[PolicyFigures]
 
 
 def comparison_page(
-    title: str, summary: str, policies: Policies, notes: Sequence[str], command: str
+    title: str,
+    summary: str,
+    policies: Policies,
+    notes: Sequence[str],
+    command: str,
+    instant: SharedInstant | None = None,
+    speed_mps: float = DEFAULT_MPS,
 ) -> str:
-    """The whole page; policies: windows last."""
+    """The whole page; policies: windows last; speed_mps: of an object."""
+    clouds = [] if instant is None else instant.clouds()
+    ticks = [] if instant is None else _age_ticks(*instant.range_ms)
+    player = {}
+    if instant is not None and clouds:
+        player = {
+            "data": page_json(toggle(instant, clouds)),
+            "script": "".join(map(asset, ("viewer.js", "player.js", "comparison.js"))),
+        }
     return render(
         "comparison.html",
         title=title,
-        verdict=_verdict(summary, policies),
+        verdict=_verdict(summary, policies, speed_mps),
+        **player,
+        instant=instant,
+        clouds=clouds,
+        colours=COLOURS,
+        lidars=[] if instant is None else _legend(instant.sensors),
+        about=about(instant, clouds) if instant is not None and clouds else "",
+        place=place_words(instant, speed_mps) if instant is not None and clouds else "",
+        instant_head=INSTANT_HEAD,
+        instant_rows=[] if instant is None else instant_rows(instant, speed_mps),
+        ages={} if instant is None else ages_plot(instant, ticks),
+        directions=[] if instant is None else direction_plots(instant, ticks),
+        speed=f"{speed_mps:g} m/s",
         notes=notes,
-        names=[(_kind(number), one.name) for number, one in enumerate(policies)],
+        names=_legend([one.name for one in policies]),
         width=_WIDTH,
         left=_LEFT,
         right=_WIDTH - _RIGHT,
@@ -60,7 +104,13 @@ def comparison_page(
     )
 
 
-def _verdict(summary: str, policies: Policies) -> Verdict:
+def _age_ticks(oldest_ms: float, newest_ms: float) -> list[float]:
+    step = nice_step(oldest_ms - newest_ms, 6)
+    first, last = math.ceil(newest_ms / step), math.floor(oldest_ms / step)
+    return [step * number for number in range(first, last + 1)]
+
+
+def _verdict(summary: str, policies: Policies, speed_mps: float) -> Verdict:
     *joined, windows = policies
     worst = max(joined, key=lambda one: one.span_ms.max(initial=0.0))
     span_ms = worst.span_ms.max(initial=0.0)
@@ -68,13 +118,13 @@ def _verdict(summary: str, policies: Policies) -> Verdict:
     heading = (
         f"Joined sweeps span up to {span_ms:.0f} ms ({worst.name}), windows up to {own_ms:.0f} ms"
     )
-    speed = SPEEDS_KMH[2]
     apart = max(joined, key=lambda one: quantile(one.apart_ms, 0.5))
     apart_ms = quantile(apart.apart_ms, 0.5)
     others = (
-        f"At {speed} km/h an object moves {offset_m(speed, span_ms):.2f} m within such a set, "
-        f"{offset_m(speed, own_ms):.2f} m within a window. The mean times of the lidars are "
-        f"{apart_ms:.0f} ms apart ({apart.name}, median): {offset_m(speed, apart_ms):.2f} m."
+        f"At {speed_mps:g} m/s an object moves {offset_m(speed_mps, span_ms):.2f} m within such a "
+        f"set, {offset_m(speed_mps, own_ms):.2f} m within a window. The mean times of the lidars "
+        f"are {apart_ms:.0f} ms apart ({apart.name}, median): "
+        f"{offset_m(speed_mps, apart_ms):.2f} m."
     )
     level = "warning" if span_ms > own_ms * 1.05 else "good"
     return Verdict(level, "Frame-level fusion against windows", heading, others, summary)
@@ -86,6 +136,10 @@ def _verdict(summary: str, policies: Policies) -> Verdict:
 def _kind(number: int) -> str:
     """The class of a policy in the style sheet."""
     return f"k{number % 4}"
+
+
+def _legend(names: Sequence[str]) -> list[tuple[str, str]]:
+    return [(_kind(number), name) for number, name in enumerate(names)]
 
 
 def nice_step(span: float, count: int) -> float:
@@ -151,14 +205,14 @@ def binned(
 
 def _offsets(policies: Policies) -> dict[str, object]:
     worst_ms = max(one.span_ms.max(initial=1.0) for one in policies)
-    axis, place = _y_axis(offset_m(SPEEDS_KMH[-1], worst_ms) * 1.12, "m")
+    axis, place = _y_axis(offset_m(SPEEDS_KMH[-1] / KMH_PER_MPS, worst_ms) * 1.12, "m")
     width = _INNER / len(SPEEDS_KMH)
     step = width / (len(policies) + 1)
     bars = []
     for group, speed in enumerate(SPEEDS_KMH):
         for number, one in enumerate(policies):
-            worst = offset_m(speed, one.span_ms.max(initial=0.0))
-            usual = offset_m(speed, quantile(one.apart_ms, 0.5))
+            worst = offset_m(speed / KMH_PER_MPS, one.span_ms.max(initial=0.0))
+            usual = offset_m(speed / KMH_PER_MPS, quantile(one.apart_ms, 0.5))
             bars.append(
                 {
                     "kind": _kind(number),

@@ -244,14 +244,17 @@ def _range(
 def _about_clouds(clouds: list[PageCloud], windows: Windows | None) -> str:
     if not clouds or windows is None:
         return ""
-    first = clouds[0]
-    kept = "all their points" if first.stride == 1 else f"every {_ordinal(first.stride)} column"
     kilobytes = sum(one.chars for one in clouds) / len(clouds) / 1000
     step_mm = max(one.step_m for one in clouds) * 1000
     return (
-        f"{len(clouds):,} of {number(len(windows), 'scan')}, with {kept}; {kilobytes:,.0f} kB per "
-        f"scan; coordinates rounded to {step_mm:.0f} mm."
+        f"{len(clouds):,} of {number(len(windows), 'scan')}, with {kept_words(clouds[0])}; "
+        f"{kilobytes:,.0f} kB per scan; coordinates rounded to {step_mm:.0f} mm."
     )
+
+
+def kept_words(cloud: PageCloud) -> str:
+    """What a page has of its scans."""
+    return "all their points" if cloud.stride == 1 else f"every {_ordinal(cloud.stride)} column"
 
 
 def _ordinal(count: int) -> str:

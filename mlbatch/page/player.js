@@ -2,7 +2,8 @@
 // Controls of a viewer: play, choice of scans, colours, keys, legend; see the macro `player`.
 
 // data: sensors, poses, begin (number of the first scan to show), play_ms (between two scans),
-// ahead (scans to load while playing), is_played (see `makeViewer`). load(number): the unpacked
+// ahead (scans to load while playing), is_played and spot (see `makeViewer`), pair (numbers of two
+// scans to flip between, instead of playing), colour. load(number): the unpacked
 // scan, perhaps later; null after the last; rejected with a reason that the page shows. last(): the
 // largest number known. Gives a function that draws again.
 function startPlayer(data, load, last) {
@@ -17,9 +18,10 @@ function startPlayer(data, load, last) {
     byId("stage").hidden = true;
     return () => {};
   }
-  const viewer = makeViewer(canvas, data.sensors, data.poses, say, data.is_played);
+  const viewer = makeViewer(canvas, data.sensors, data.poses, say, data.is_played, data.spot);
   const isFree = (colour) => !document.querySelector("[data-colour=" + colour + "]").disabled;
   if (data.sensors.length > 1 && isFree("lidar")) colouring = "lidar";
+  if (data.colour) colouring = data.colour;
 
   // The points of a scan; a few of them stay unpacked.
   const loads = new Map();
@@ -52,12 +54,13 @@ function startPlayer(data, load, last) {
       const [low, high] = cloud.height.map((one) => (Math.round(one * 10) / 10 + 0).toFixed(1));
       item("height " + low + " to " + high + " m", ramp);
     } else if (colouring === "time") {
-      const [low, high] = cloud.times.map((one) => one.toFixed(0));
-      item("time " + low + " to " + high + " ms", ramp);
+      const [low, high] = cloud.times.map((one) => Math.round(cloud.ages ? -one : one) + 0);
+      item((cloud.ages ? "age " : "time ") + low + " to " + high + " ms", ramp);
     } else item("intensity, 2 % to 98 % of the points", ramp);
   }
 
   const stop = () => {
+    if (playing === null) return;
     clearTimeout(playing);
     playing = null;
     play.textContent = "Play";
@@ -102,7 +105,15 @@ function startPlayer(data, load, last) {
     playing = setTimeout(step, Math.max(0, due - performance.now()));
   }
 
+  // The scan to flip back to.
+  let other = data.begin;
+  const flip = () => {
+    const last = data.pair[1];
+    if (chosen !== last) other = chosen;
+    show(chosen === last ? other : last);
+  };
   const toggle = () => {
+    if (data.pair) { flip(); return; }
     if (playing !== null) { stop(); return; }
     play.textContent = "Pause";
     playing = setTimeout(step, 0);
@@ -118,6 +129,10 @@ function startPlayer(data, load, last) {
   slider.addEventListener("input", () => choose(Number(slider.value)));
   play.addEventListener("click", toggle);
   byId("fit").addEventListener("click", viewer.fit);
+  if (byId("spot")) {
+    byId("spot").hidden = !data.spot;
+    byId("spot").addEventListener("click", viewer.place);
+  }
   byId("above").addEventListener("click", viewer.above);
   byId("full").addEventListener("click", () => {
     if (document.fullscreenElement) document.exitFullscreen();
@@ -126,6 +141,7 @@ function startPlayer(data, load, last) {
   canvas.addEventListener("keydown", (event) => {
     if (event.ctrlKey || event.altKey || event.metaKey) return;
     if (event.key === " ") toggle();
+    else if (event.key === "p" && data.spot) viewer.place();
     else if (event.key === "." || event.key === ",") choose(chosen + (event.key === "." ? 1 : -1));
     else if (event.key === "c") {
       const names = [...document.querySelectorAll("[data-colour]:enabled")]

@@ -90,11 +90,12 @@ def joined_cloud(
     expected: I64Array,
     stride: int = 1,
     level: int = 6,
+    times_ns: tuple[int, int] | None = None,
 ) -> PageCloud:
     """Join the scans of a window.
 
     expected: columns of a whole window by lidar; stride: keep every nth column of each; level: of
-    the compression, 0 to 9.
+    the compression, 0 to 9; times_ns: range of times to store, where it is not that of the points.
     """
     parts = [_valid(scan) for scan in scans]
     total = sum(len(part.xyz) for part in parts)
@@ -103,8 +104,9 @@ def joined_cloud(
     rings = [part.ring for part in parts if part.ring is not None]
     bright = [part.intensity for part in parts if part.intensity is not None]
     # Some outputs have no times.
-    first_ns = min([0, *(int(one.min(initial=0)) for one in times)])
-    last_ns = max([window_ns, *(int(one.max(initial=0)) for one in times)])
+    first_ns, last_ns = times_ns or (0, window_ns)
+    first_ns = min([first_ns, *(int(one.min(initial=first_ns)) for one in times)])
+    last_ns = max([last_ns, *(int(one.max(initial=last_ns)) for one in times)])
     has_lidar = len(lidars) == len(parts)
     has_time = len(times) == len(parts)
     has_ring = len(rings) == len(parts)

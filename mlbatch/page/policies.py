@@ -10,7 +10,9 @@ from mlbatch.arrays import F64Array
 
 # Speeds that offsets of objects are shown for, km/h.
 SPEEDS_KMH = (10, 30, 50, 100)
-_KMH_PER_M_S = 3.6
+KMH_PER_MPS = 3.6
+# Of an object, if no other speed is asked for.
+DEFAULT_MPS = 10.0
 _MS_PER_S = 1000
 
 
@@ -43,9 +45,9 @@ class PolicyFigures:
         return max(0.0, 1 - twice - never), twice, never
 
 
-def offset_m(speed_kmh: float, time_ms: float) -> float:
+def offset_m(speed_mps: float, time_ms: float) -> float:
     """Way of an object in a time: how far apart two lidars show it."""
-    return speed_kmh / _KMH_PER_M_S * time_ms / _MS_PER_S
+    return speed_mps * time_ms / _MS_PER_S
 
 
 def quantile(values: F64Array, share: float) -> float:

@@ -292,9 +292,10 @@ class Camera {
 
 // Let a canvas show scans. names, poses: of the lidars; say: called with the reason when points are
 // drawn without WebGL; isPlayed: many scans per second, which the processor draws several times
-// faster without WebGL. Gives an object with `show(cloud, colouring)`, `fit()`, `above()` and
-// `draw()`.
-function makeViewer(canvas, names, poses, say, isPlayed) {
+// faster without WebGL; spot: place to begin at, with a circle (target, radius and distance of the
+// camera in m, yaw). Gives an object with `show(cloud, colouring)`, `fit()`, `above()`, `place()`
+// and `draw()`.
+function makeViewer(canvas, names, poses, say, isPlayed, spot) {
   const camera = new Camera();
   let base = null, paint = null;
   let cloud = null, colouring = "height", colours = null;
@@ -344,22 +345,31 @@ function makeViewer(canvas, names, poses, say, isPlayed) {
     ctx.fillText(text, x, y);
   }
 
-  // Circles around the body at round distances.
+  function drawRing(ctx, [x, y, z], radius, width, height) {
+    ctx.beginPath();
+    let before = null;
+    for (let i = 0; i <= 96; i++) {
+      const turn = i / 48 * Math.PI;
+      const at = camera.pixel([x + radius * Math.cos(turn), y + radius * Math.sin(turn), z],
+        width, height);
+      if (at && before) { ctx.moveTo(...before); ctx.lineTo(...at); }
+      before = at;
+    }
+    ctx.stroke();
+  }
+
+  // Circles around the body at round distances, and around the spot.
   function drawRings(ctx, width, height) {
     const step = niceStep(camera.distance, 3);
+    if (spot) {
+      ctx.strokeStyle = color("problem");
+      ctx.lineWidth = 2;
+      drawRing(ctx, spot.target, spot.radius, width, height);
+    }
+    ctx.strokeStyle = color("ring");
+    ctx.lineWidth = 1;
     for (let k = 1; k <= 4; k++) {
-      ctx.beginPath();
-      let before = null;
-      for (let i = 0; i <= 96; i++) {
-        const turn = i / 48 * Math.PI;
-        const at = camera.pixel([k * step * Math.cos(turn), k * step * Math.sin(turn), 0],
-          width, height);
-        if (at && before) { ctx.moveTo(...before); ctx.lineTo(...at); }
-        before = at;
-      }
-      ctx.strokeStyle = color("ring");
-      ctx.lineWidth = 1;
-      ctx.stroke();
+      drawRing(ctx, [0, 0, 0], k * step, width, height);
       const at = camera.pixel([0, -k * step, 0], width, height);
       if (at) label(ctx, +(k * step).toPrecision(3) + " m", at[0] + 3, at[1] - 3, color("soft"));
     }
@@ -433,7 +443,8 @@ function makeViewer(canvas, names, poses, say, isPlayed) {
       cloud.has.lidar && names[cloud.lidar[i]],
       cloud.has.ring && "ring " + cloud.ring[i],
       range.toFixed(2) + " m from the " + (pose ? "lidar" : "body"),
-      cloud.has.time && (timeOf(i) < 0 ? "" : "+") + timeOf(i).toFixed(2) + " ms",
+      cloud.has.time && (cloud.ages ? (-timeOf(i)).toFixed(2) + " ms old" :
+        (timeOf(i) < 0 ? "" : "+") + timeOf(i).toFixed(2) + " ms"),
       place.map((one) => one.toFixed(2)).join(", ") + " m",
     ].filter(Boolean);
   }
@@ -461,6 +472,12 @@ function makeViewer(canvas, names, poses, say, isPlayed) {
     draw();
   };
   const fit = () => { if (cloud) camera.fit(cloud); pointed = null; draw(); };
+  const place = () => {
+    camera.turn(spot.yaw, .5);
+    camera.target = spot.target;
+    camera.distance = spot.distance;
+    draw();
+  };
   const view = (yaw, pitch) => { camera.turn(yaw, pitch); fit(); };
 
   const fingers = new Map();
@@ -527,9 +544,10 @@ function makeViewer(canvas, names, poses, say, isPlayed) {
       cloud = next;
       colouring = how;
       camera.aspect = canvas.clientWidth / Math.max(1, canvas.clientHeight);
-      if (isFirst) camera.fit(cloud);
+      if (isFirst && spot) place();
+      else if (isFirst) camera.fit(cloud);
       drawNow();
     },
-    fit, above: () => view(0, Math.PI / 2), draw: drawNow,
+    fit, place, above: () => view(0, Math.PI / 2), draw: drawNow,
   };
 }

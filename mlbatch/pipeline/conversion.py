@@ -8,7 +8,7 @@ import time
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, NamedTuple, Protocol, TypeVar
 
 from mlbatch.batching.batcher import SLACK_NS, Batcher
 from mlbatch.batching.grid import Grid
@@ -86,6 +86,14 @@ class Stages:
             yield item
 
 
+class PacketUser(Protocol):
+    """What decodes columns of windows after the loop has gone on."""
+
+    def oldest_ring_index(self, sensor: int) -> int | None:
+        """First ring index of a sensor that is still needed; None: none."""
+        ...
+
+
 class SkippedWindow(NamedTuple):
     """A window with columns that gives no scan (`--drop-incomplete`)."""
 
@@ -97,7 +105,7 @@ class Conversion:
 
     info, table: None before the first window; poses: known once closed; dropped_incomplete:
     windows left out by `--drop-incomplete`; notes_before_points: number of warnings that precede
-    those about points.
+    those about points; users: of raw packets, besides the run itself.
     """
 
     def __init__(self, job: Job, buffers: int = 1, progress: Progress | None = None) -> None:
@@ -133,6 +141,7 @@ class Conversion:
         self.passthrough.refuse_unknown(self.session.recordings)
         self.info: RunInfo | None = None
         self.table: ScanTable | None = None
+        self.users: list[PacketUser] = []
         self.dropped_incomplete = 0
         self.notes_before_points = 0
         self.deskew = self._deskew()
@@ -173,7 +182,7 @@ class Conversion:
         )
 
         slots = [sensor.source().slots for sensor in self.sensors]
-        points = WindowPoints(self.grid, slots, self._plain_decoder)
+        points = WindowPoints(self.grid, slots, self.plain_decoder)
         if job.deskew == CONSTANT_VELOCITY:
             return ConstantVelocity(job.deskew_to, points, len(self.sensors))
         from mlbatch.pipeline.deskew import IMU, Deskew, ImuPoses, Trajectory
@@ -191,7 +200,7 @@ class Conversion:
             return None
         from mlbatch.pipeline.pose_check import PoseCheck
 
-        return PoseCheck(self.sensors, self.job.slices, self._plain_decoder)
+        return PoseCheck(self.sensors, self.job.slices, self.plain_decoder)
 
     def _topic_offset_ns(self, topic: Topic) -> int | None:
         """Scan clock minus receive time, as for messages of an IMU that are forwarded."""
@@ -200,7 +209,7 @@ class Conversion:
         is_epoch = common_timescale(self._timescales()) in _EPOCH_SCALES
         return self._scan_offset_ns() if is_epoch else None
 
-    def _plain_decoder(self) -> Decoder:
+    def plain_decoder(self) -> Decoder:
         """A decoder for the thread that batches: dense scans of all sensors, with columns."""
         # There is a window, so that the clocks are known.
         info = self._run_info()._replace(layout="dense", sort="columns")
@@ -299,13 +308,8 @@ class Conversion:
         """First ring index of each sensor that is still needed, to be batched or decoded."""
         oldest = []
         for sensor in self.sensors:
-            ring_indexes = [self.batcher.oldest_ring_index(sensor.index)]
-            if self.fusion is not None:
-                ring_indexes.append(self.fusion.oldest_ring_index(sensor.index))
-            if self.deskew is not None:
-                ring_indexes.append(self.deskew.oldest_ring_index(sensor.index))
-            if self._pool is not None:
-                ring_indexes.append(self._pool.oldest_ring_index(sensor.index))
+            users = (self.batcher, self.fusion, self.deskew, self._pool, *self.users)
+            ring_indexes = (one.oldest_ring_index(sensor.index) for one in users if one is not None)
             known = (index for index in ring_indexes if index is not None)
             oldest.append(min(known, default=None))
         return oldest

@@ -98,8 +98,8 @@ def test_a_page_and_figures(shell: Shell, tmp_path: Path) -> None:
     assert (outcome.code, outcome.err) == (0, "")
     page = (tmp_path / "run.html").read_text()
     assert "Joined sweeps span up to 163 ms (latest sweeps), windows up to 100 ms" in page
-    # 163 ms at 13.889 m/s.
-    assert "moves 2.26 m within such a set" in page
+    # 163 ms at 10 m/s.
+    assert "moves 1.63 m within such a set" in page
     written = sorted(path.name for path in (tmp_path / "plots").iterdir())
     assert written == sorted(f"{name}.{kind}" for name in FIGURES for kind in ("pdf", "png"))
     lines = outcome.out.splitlines()

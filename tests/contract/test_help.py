@@ -35,7 +35,8 @@ OPTIONS: dict[str, set[str]] = {
         """,
         "batch-status": "json page",
         "inspect": "rig whole verbose metadata json write-rig",
-        "compare": "rig rate metadata clock tolerance timeout html figures overwrite verbose json",
+        "compare": """rig rate metadata clock tolerance timeout html figures speed overwrite verbose
+            json""",
         "sensors": "json",
         "verify": "report json verbose",
         "report": "output report html-scans overwrite",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator
+from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
 
@@ -12,8 +13,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from mlbatch.outputs.stored_scan import StoredScan
 from mlbatch.page import write_text_page
 from mlbatch.page.comparison import binned, comparison_page, nice_step
+from mlbatch.page.instant import InstantSet, SharedInstant, Spot, place_words
 from mlbatch.page.policies import PolicyFigures, offset_m, quantile
 from tests.page.browser import CHROMIUM, NO_CHROMIUM, Browser, browser
 
@@ -41,22 +44,61 @@ def _policy(
 POLICIES = (_policy("latest sweeps", 180, 36, 200), _policy("windows (mlbatch)", 100, 0, 110))
 
 
-def _page(policies: tuple[PolicyFigures, ...] = POLICIES, title: str = "drive.pcap") -> str:
-    return comparison_page(title, f"of {title}", policies, [f"loss: {title}"], f"mlbatch {title}")
+def _page(
+    policies: tuple[PolicyFigures, ...] = POLICIES,
+    title: str = "drive.pcap",
+    instant: SharedInstant | None = None,
+) -> str:
+    notes = [f"loss: {title}"]
+    return comparison_page(title, f"of {title}", policies, notes, f"mlbatch {title}", instant)
+
+
+def _set(name: str, oldest_ms: float, *, has_cloud: bool = True) -> InstantSet:
+    """A ring of two lidars, the second of which is up to 50 ms older."""
+    turn = np.linspace(-np.pi, np.pi, 3600, endpoint=False)
+    height = np.random.default_rng(1).uniform(0, 2, len(turn))
+    xyz = np.stack([10 * np.cos(turn), 10 * np.sin(turn), height], 1).astype(np.float32)
+    lidar = (np.arange(len(turn)) % 2).astype(np.uint8)
+    time_ns = np.linspace(-1e8, 0, len(turn)).astype(np.int64)
+    time_ns[lidar == 1] -= round((oldest_ms - 100) * 1e6)
+    cloud = StoredScan("", 0, xyz, organized=False, time_ns=time_ns, lidar_id=lidar)
+    ages_ms = ((100.0, 0.0), (oldest_ms, oldest_ms - 100))
+    spot_ms = (50.0, oldest_ms - 50)
+    if not has_cloud:
+        return InstantSet(name, ages_ms)
+    return InstantSet(name, ages_ms, cloud, spot_ms, (oldest_ms - 100, oldest_ms - 100))
+
+
+def _instant(name: str = "latest sweeps", *, has_clouds: bool = True) -> SharedInstant:
+    return SharedInstant(
+        at_s=2.1,
+        looked=8,
+        sensors=(name, "rear"),
+        poses=(np.eye(4), np.eye(4)),
+        period_ns=100_000_000,
+        columns=np.array([1800, 1800]),
+        sets=tuple(
+            _set(one, oldest_ms, has_cloud=has_clouds)
+            for one, oldest_ms in ((name, 150.0), ("windows (mlbatch)", 100.0))
+        ),
+        shown=0,
+        spot=Spot((10.0, 0.0, 0.0), 2.5, 140, 157) if has_clouds else None,
+        why="" if has_clouds else "No merged clouds: rear without extrinsics.",
+    )
 
 
 def test_the_way_of_an_object() -> None:
-    # 50 km/h = 13.889 m/s.
-    assert offset_m(50, 180) == pytest.approx(2.5)
-    assert offset_m(36, 100) == pytest.approx(1.0)
+    # The example of the paper: 10 km/h, a period of 10 Hz.
+    assert offset_m(10 / 3.6, 100) == pytest.approx(0.28, abs=0.005)
+    assert offset_m(10, 97) == pytest.approx(0.97)
 
 
 def test_the_verdict_is_in_words() -> None:
     page = _page()
     assert "Joined sweeps span up to 180 ms (latest sweeps), windows up to 100 ms" in page
-    # 180 ms, 100 ms and 36 ms at 13.889 m/s.
-    assert "moves 2.50 m within such a set, 1.39 m within a window" in page
-    assert "36 ms apart (latest sweeps, median): 0.50 m" in page
+    # 180 ms, 100 ms and 36 ms at 10 m/s.
+    assert "moves 1.80 m within such a set, 1.00 m within a window" in page
+    assert "36 ms apart (latest sweeps, median): 0.36 m" in page
     assert "<div class='verdict warning'" in page
     alike = (_policy("latest sweeps", 100, 0, 100), POLICIES[1])
     assert "<div class='verdict good'" in _page(alike)
@@ -78,8 +120,11 @@ def test_offsets_columns_and_latencies_are_shown() -> None:
     assert "110 ms (to 110 ms)" in page
 
 
-def test_nothing_of_a_recording_is_code_or_loaded() -> None:
-    page = _page((_policy(HOSTILE, 1, 1, 1), POLICIES[1]), HOSTILE)
+@pytest.mark.parametrize(("instant", "scripts"), [(None, 0), (_instant(HOSTILE), 2)])
+def test_nothing_of_a_recording_is_code_or_loaded(
+    instant: SharedInstant | None, scripts: int
+) -> None:
+    page = _page((_policy(HOSTILE, 1, 1, 1), POLICIES[1]), HOSTILE, instant)
     tags: list[str] = []
 
     class Parser(HTMLParser):
@@ -88,9 +133,34 @@ def test_nothing_of_a_recording_is_code_or_loaded() -> None:
             assert not {name for name, _ in attrs} & {"src", "onload", "onclick"}
 
     Parser().feed(page)
-    assert "script" not in tags
+    assert tags.count("script") == scripts
     assert "default-src 'none'" in page
+    # Base64 has slashes.
+    page = re.sub(r'"data":"[^"]*"', "", page)
     assert re.findall(r"(?:https?:)?//\w", page) == []
+
+
+def test_the_instant_is_in_words() -> None:
+    page = " ".join(_page(instant=_instant()).split())
+    assert "140 of 157 points of the fused set above the ground have no point of the window" in page
+    # 50 ms at 10 m/s.
+    assert "stands at two places 0.50 m apart (latest sweeps: 50 ms between the lidars)" in page
+    assert "in the window: 0.00 m (0 ms)" in page
+    without = _page(instant=_instant(has_clouds=False))
+    assert "No merged clouds: rear without extrinsics." in without
+    assert "latest sweeps, rear: 150.0 to 50.0 ms before the instant" in without
+    same = place_words(replace(_instant(), spot=None), 10)
+    assert "At no place are the lidars of a fused set farther apart" in same
+
+
+def test_large_clouds_keep_every_nth_column(monkeypatch: pytest.MonkeyPatch) -> None:
+    whole = _instant().clouds()
+    assert [(one.stride, one.shown) for one in whole] == [(1, 3600)] * 2
+    monkeypatch.setattr("mlbatch.page.instant.MOST_CHARS", sum(one.chars for one in whole) * 0.8)
+    fewer = _instant().clouds()
+    assert [one.stride for one in fewer] == [2, 2]
+    assert all(abs(one.shown - 1800) <= 1 for one in fewer)
+    assert "with every 2nd column" in _page(instant=_instant())
 
 
 def test_a_policy_without_sets_is_shown() -> None:
@@ -135,6 +205,31 @@ def test_quantiles_are_by_nearest_rank() -> None:
 def tab(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
     with browser(tmp_path_factory.mktemp("profile")) as found:
         yield found
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason=NO_CHROMIUM)
+def test_both_clouds_are_shown_from_one_place(tab: Browser, tmp_path: Path) -> None:
+    path = tmp_path / "page.html"
+    write_text_page(path, _page(instant=_instant()))
+    tab.open(path)
+    image = "document.querySelector('#stage canvas').toDataURL()"
+    shown = "document.documentElement.dataset.shown"
+    fused = tab.run(image)
+    assert tab.run(shown) == "0"
+    assert "age 150 to 0 ms" in tab.run("document.getElementById('legend').textContent")
+    tab.run("document.getElementById('cloud').focus()")
+    tab.press(" ")
+    assert tab.run(shown) == "1"
+    windows = tab.run(image)
+    # Of another colour, since as old as the other lidar.
+    assert windows != fused
+    tab.run("document.getElementById('play').click()")
+    tab.press("f")
+    assert tab.run(shown) == "0"
+    assert tab.run(image) != fused
+    tab.press("p")
+    assert tab.run(image) == fused
+    assert tab.errors == []
 
 
 @pytest.mark.skipif(CHROMIUM is None, reason=NO_CHROMIUM)
