@@ -1,15 +1,18 @@
-"""Errors of `find_poses` over simulated rigs, guesses and scenes; run by hand.
+"""Errors of `calibrated` over simulated rigs, guesses and scenes; run by hand.
 
-python -m tests.poses.evaluate FOLDER make [SCENE...]      simulate, once
-python -m tests.poses.evaluate FOLDER run GUESSES [SCENE...]  print the table
+python -m tests.poses.evaluate FOLDER make [SCENE...]                   simulate, once
+python -m tests.poses.evaluate FOLDER run GUESSES SHARE SEED SCENE...   print rows of the table
+
+SCENE: a name, of all three rigs, or with the number of lidars, as room-3. SHARE: of the largest
+error of a guess. Columns: guesses, determined, median mm and degrees, worst mm and degrees, share
+within two standard deviations, CPU.
 """
 
 from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import product
 from pathlib import Path
 
@@ -18,9 +21,12 @@ import yaml
 
 import mlbatch
 from mlbatch.arrays import F64Array
-from mlbatch.motion.registration import Pose
+from mlbatch.errors import RecordingError
+from mlbatch.frames.transforms import compose, from_rpy_deg
 from mlbatch.motion.se3 import exp_rotation, log_rotation
-from mlbatch.poses.solve import Cloud, Solution, find_poses
+from mlbatch.poses.calibration import LidarPose, calibrated
+from mlbatch.poses.places import KeptPlace, Places
+from mlbatch.poses.solve import Cloud
 from mlbatch.simulate.recording import write_recording
 from mlbatch.simulate.scenario import read_scenario
 
@@ -28,8 +34,9 @@ SCENARIOS = Path(mlbatch.__file__).parent / "simulate" / "scenarios"
 STANDSTILL_S, DURATION_S = 1.0, 4.0
 # Largest error of a guess.
 MOST_M, MOST_DEG = 1.0, 20.0
-# What is required: median, worst; mm, degrees.
 FARTHEST_M = 60.0
+# First windows of places: one at standstill, one between each two of these in motion.
+MOVING = np.array([11, 16, 21, 26, 31, 38])
 
 
 def sensor(name: str, model: str, at: str, **more: object) -> dict[str, object]:
@@ -152,125 +159,101 @@ def make(folder: Path, scene: str, rig: int) -> None:
 
 @dataclass(slots=True, eq=False)
 class Case:
-    """Places of a recording, converted with a wrong rig; wrong: motions of the lidars' points."""
+    """Places of a recording, converted with poses (4, 4) that are wrong; true: those that are."""
 
-    places: list[list[Cloud]]
-    wrong: list[Pose]
+    places: Places
+    poses: list[F64Array]
+    true: list[F64Array]
 
 
-def origins(folder: Path, scene: str, rig: int) -> list[F64Array]:
-    """Where the lidars are, m."""
+def true_poses(folder: Path, scene: str, rig: int) -> list[F64Array]:
+    """Poses (4, 4) body_from_sensor of the lidars."""
     read = yaml.safe_load((folder / f"{scene}-{rig + 2}" / "scenario.yaml").read_text())
-    return [np.array(row["extrinsics"]["translation_m"]) for row in read["sensors"]]
+    rows = [row["extrinsics"] for row in read["sensors"]]
+    return [from_rpy_deg(row["translation_m"], row["rotation_rpy_deg"]) for row in rows]
 
 
-def places_of(folder: Path, scene: str, rig: int, numbers: list[int]) -> list[list[Cloud]]:
-    """Places at the true poses: two windows from each of the numbers, without the machine."""
-    box = MACHINE if scene == HARVESTER else np.zeros((2, 3))
-    origin_m = origins(folder, scene, rig)
-    with np.load(folder / f"{scene}-{rig + 2}.npz") as stored:
-        found = []
-        for number in numbers:
-            instant_ns = int(stored[f"window_{number}"][1])
-            clouds = []
-            for at, lidar in product((number, number + 1), range(rig + 2)):
-                points_m = stored[f"xyz_{at}_{lidar}"].astype(np.float64)
-                kept = ((points_m < box[0]) | (points_m > box[1])).any(axis=1)
-                time_s = (stored[f"time_{at}_{lidar}"] - instant_ns) * 1e-9
-                clouds.append(Cloud(lidar, points_m[kept], time_s[kept], origin_m[lidar]))
-            found.append(clouds)
-        return found
-
-
-def guesses(
-    places: list[list[Cloud]], lidars: int, count: int, share: float, seed: int
-) -> Iterator[Case]:
-    """Cases with errors of each lidar but the first up to the share of the most."""
+def guess(folder: Path, scene: str, rig: int, share: float, seed: int) -> Case:
+    """Some places and a guess of each pose but the first, off by up to the share of the most."""
     rng = np.random.default_rng(seed)
-    for _ in range(count):
-        wrong = [Pose(np.eye(3), np.zeros(3))]
-        for _ in range(lidars - 1):
-            axis, way = rng.normal(size=(2, 3))
-            axis *= np.deg2rad(MOST_DEG) * share * rng.uniform(0.3, 1) / np.linalg.norm(axis)
-            way *= MOST_M * share * rng.uniform(0.3, 1) / np.linalg.norm(way)
-            wrong.append(Pose(exp_rotation(axis[None])[0], way))
-        yield Case(
-            [
-                [
-                    Cloud(
-                        cloud.lidar,
-                        _moved(cloud.points_m, wrong[cloud.lidar]),
-                        cloud.time_s,
-                        None
-                        if cloud.origin_m is None
-                        else _moved(cloud.origin_m, wrong[cloud.lidar]),
-                    )
-                    for cloud in place
-                ]
-                for place in places
-            ],
-            wrong,
-        )
+    begins = [int(rng.integers(1, 8)), *(int(n) for n in rng.integers(MOVING[:-1], MOVING[1:]))]
+    rng = np.random.default_rng(1000 * rig + seed)
+    true = true_poses(folder, scene, rig)
+    wrong = [np.eye(4)]
+    for _ in true[1:]:
+        axis, way = rng.normal(size=(2, 3))
+        axis *= np.deg2rad(MOST_DEG) * share * rng.uniform(0.3, 1) / np.linalg.norm(axis)
+        way *= MOST_M * share * rng.uniform(0.3, 1) / np.linalg.norm(way)
+        error = np.eye(4)
+        error[:3, :3], error[:3, 3] = exp_rotation(axis[None])[0], way
+        wrong.append(error)
+    poses = [compose(error, pose) for error, pose in zip(wrong, true, strict=True)]
+    box = MACHINE if scene == HARVESTER else np.zeros((2, 3))
+    kept = []
+    with np.load(folder / f"{scene}-{rig + 2}.npz") as stored:
+        for begin in begins:
+            start_ns, instant_ns = stored[f"window_{begin}"].tolist()
+            clouds = []
+            for at, lidar in product((begin, begin + 1), range(rig + 2)):
+                points_m = stored[f"xyz_{at}_{lidar}"].astype(np.float64)
+                outside = ((points_m < box[0]) | (points_m > box[1])).any(axis=1)
+                points_m = points_m[outside] @ wrong[lidar][:3, :3].T + wrong[lidar][:3, 3]
+                time_s = (stored[f"time_{at}_{lidar}"][outside] - instant_ns) * 1e-9
+                clouds.append(Cloud(lidar, points_m, time_s, poses[lidar][:3, 3]))
+            kept.append(KeptPlace(clouds, start_ns, np.zeros(0)))
+    return Case(Places(kept, 2 * len(kept), [0] * len(true)), poses, true)
 
 
-def _moved(points_m: F64Array, pose: Pose) -> F64Array:
-    found: F64Array = np.matmul(points_m, pose.rotation.T) + pose.position_m
-    return found
+@dataclass(slots=True, eq=False)
+class Tally:
+    """Errors of poses that were found: mm, degrees, and whether each is within two deviations."""
+
+    runs: int = 0
+    determined: int = 0
+    seconds: float = 0.0
+    shift_mm: list[float] = field(default_factory=list)
+    turn_deg: list[float] = field(default_factory=list)
+    inside: list[bool] = field(default_factory=list)
+
+    def add(self, lidar: LidarPose, true: F64Array) -> str:
+        """Count a pose; its errors in words."""
+        found = lidar.body_from_sensor
+        shift_mm = 1000 * (found - true)[:3, 3]
+        turn_deg = np.rad2deg(log_rotation((found[:3, :3] @ true[:3, :3].T)[None])[0])
+        off = np.abs([*(shift_mm / lidar.sigma_mm), *(turn_deg / lidar.sigma_deg)])
+        self.shift_mm.append(float(np.linalg.norm(shift_mm)))
+        self.turn_deg.append(float(np.linalg.norm(turn_deg)))
+        self.inside += (off <= 2).tolist()
+        return f"{self.shift_mm[-1]:.1f} mm {self.turn_deg[-1]:.3f} deg {off.max():.1f} sd"
+
+    def row(self, name: str) -> str:
+        """A row of the table."""
+        cells = ["-"] * 5
+        if self.inside:
+            errors = (self.shift_mm, self.turn_deg)
+            middle, worst = [[float(f(part)) for part in errors] for f in (np.median, max)]
+            cells = [f"{middle[0]:.1f}", f"{middle[1]:.3f}", f"{worst[0]:.1f}", f"{worst[1]:.3f}"]
+            cells.append(f"{100 * np.mean(self.inside):.0f} %")
+        each = f"{self.seconds / max(1, self.runs):.1f} s"
+        return " | ".join(["", name, str(self.runs), str(self.determined), *cells, each, ""])
 
 
-def errors(case: Case, solution: Solution) -> F64Array:
-    """Error of each lidar but the first: (lidars - 1, 6), m and rad, as a left motion."""
-    found = []
-    for wrong, correction in zip(case.wrong[1:], solution.state.corrections[1:], strict=True):
-        turn = np.matmul(correction.rotation, wrong.rotation)
-        shift = np.matmul(correction.rotation, wrong.position_m) + correction.position_m
-        found.append(np.concatenate([shift, log_rotation(turn[None])[0]]))
-    return np.array(found)
-
-
-def run(folder: Path, scene: str, rig: int, count: int, share: float, first: int) -> None:
-    """Print the errors of a recording, over guesses and choices of places."""
-    lidars = rig + 2
-    shift, turn, inside, weak, seconds = [], [], [], [], 0.0
-    for seed in range(first, first + count):
-        rng = np.random.default_rng(seed)
-        numbers = [
-            int(rng.integers(1, 8)),
-            *(int(n) for n in rng.integers([12, 19, 26], [19, 26, 37])),
-        ]
-        places = places_of(folder, scene, rig, numbers)
-        for case in guesses(places, lidars, 1, share, 1000 * rig + seed):
-            began = time.process_time()
-            solution = find_poses(case.places, lidars)
-            seconds += time.process_time() - began
-            error = errors(case, solution)
-            free = solution.weak.shape[1]
-            weak.append(free)
-            sigma = np.sqrt(np.diag(solution.covariance)).reshape(-1, 6)
-            print(
-                f"  {scene}-{lidars} seed {seed} at {numbers} weak {free} rms {solution.rms:.2f}",
-                f"{'' if solution.converged else 'not converged '}mm",
-                np.round(1e3 * np.linalg.norm(error[:, :3], axis=1), 1),
-                "deg",
-                np.round(np.rad2deg(np.linalg.norm(error[:, 3:], axis=1)), 3),
-                "z",
-                np.round(np.abs(error / sigma).max(axis=1), 1),
-                flush=True,
-            )
-            if free:
-                continue
-            shift += list(1e3 * np.linalg.norm(error[:, :3], axis=1))
-            turn += list(np.rad2deg(np.linalg.norm(error[:, 3:], axis=1)))
-            inside += list((np.abs(error) <= 2 * sigma).ravel())
-    if shift:
-        print(
-            f"{scene}-{lidars}: {count} guesses, {sum(1 for w in weak if not w)} determined, "
-            f"mm {np.median(shift):.2f} {max(shift):.2f}, "
-            f"deg {np.median(turn):.4f} {max(turn):.4f}, "
-            f"2 sigma {100 * np.mean(inside):.0f} %, {seconds / count:.1f} s"
-        )
-    else:
-        print(f"{scene}-{lidars}: none of {count} determined, {seconds / count:.1f} s")
+def run(folder: Path, scene: str, rig: int, seeds: range, share: float, tally: Tally) -> None:
+    """Calibrate a recording from guesses; print the errors or the reason of each refusal."""
+    names = "abcd"[: rig + 2]
+    for seed in seeds:
+        case = guess(folder, scene, rig, share, seed)
+        began = time.process_time()
+        try:
+            found = calibrated(case.places, names, case.poses)
+            tally.determined += 1
+            pairs = zip(found.lidars[1:], case.true[1:], strict=True)
+            words = ", ".join(tally.add(lidar, true) for lidar, true in pairs)
+        except RecordingError as err:
+            words = str(err)
+        tally.runs += 1
+        tally.seconds += time.process_time() - began
+        print(f"  {scene}-{rig + 2} seed {seed}: {words}", flush=True)
 
 
 def main(arguments: list[str]) -> None:
@@ -282,9 +265,13 @@ def main(arguments: list[str]) -> None:
                 make(Path(folder), scene, rig)
     else:
         count, share, first, *scenes = rest
+        seeds = range(int(first), int(first) + int(count))
         for name in scenes:
-            scene, _, lidars = name.rpartition("-")
-            run(Path(folder), scene, int(lidars) - 2, int(count), float(share), int(first))
+            scene, _, lidars = name.rpartition("-") if name[-1].isdigit() else (name, "", "")
+            tally = Tally()
+            for rig in [int(lidars) - 2] if lidars else range(3):
+                run(Path(folder), scene, rig, seeds, float(share), tally)
+            print(tally.row(name), flush=True)
 
 
 if __name__ == "__main__":
