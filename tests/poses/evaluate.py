@@ -36,7 +36,7 @@ STANDSTILL_S, DURATION_S = 1.0, 4.0
 MOST_M, MOST_DEG = 1.0, 20.0
 FARTHEST_M = 60.0
 # First windows of places: one at standstill, one between each two of these in motion.
-MOVING = np.array([11, 16, 21, 26, 31, 38])
+MOVING = np.array([11, 16, 21, 26, 31, 37])
 
 
 def sensor(name: str, model: str, at: str, **more: object) -> dict[str, object]:
@@ -92,9 +92,11 @@ WALL = {
         {"corner_m": [-200, 8, 0], "along_m": [400, 0, 0], "across_m": [0, 0, 5]},
     ]
 }
-# Scenes that do not determine all: unit directions of shift and turn (rad) that are not seen, of a
-# lidar against the first, body frame along the world's.
-DEGENERATE = {"corridor": CORRIDOR, "plane": PLANE, "wall": WALL}
+# Each lidar in a room of its own, m.
+APART_M = 20.0
+APART = {"boxes": [{"centre_m": [0, APART_M * n, 2], "size_m": [12, 8, 4]} for n in range(4)]}
+# Scenes that do not determine all.
+DEGENERATE = {"corridor": CORRIDOR, "plane": PLANE, "wall": WALL, "apart": APART}
 HARVESTER = "harvester-hard"
 # Of the harvester with its boom, as --exclude-box leaves it out.
 MACHINE = np.array([[-2.3, -1.15, 0.4], [6.5, 1.15, 4.5]])
@@ -109,19 +111,18 @@ def scenario(scene: str, rig: int) -> dict[str, object]:
             "scene": DEGENERATE[scene],
             "motion": {"waypoints": [[0, 0, 0, 0.6, 0], [4, 3, 0, 0.6, 0], [60, 45, 0, 0.6, 0]]},
         }
-    elif scene == "apart":
-        found = yaml.safe_load((SCENARIOS / "room.yaml").read_text())
     else:
         found = yaml.safe_load((SCENARIOS / f"{scene}.yaml").read_text())
-    low = scene in ("room", "street", "apart", *DEGENERATE)
+    low = scene in ("room", "street", *DEGENERATE)
     sensors = rigs(low, 40.0 if scene == HARVESTER else 80.0)[rig]
     if scene == HARVESTER:
         for row in sensors:
             row["divergence_deg"] = 0.35
-    if scene == "street":
-        for row in sensors:
-            at = row["extrinsics"]["translation_m"]  # type: ignore[index]
-            row["extrinsics"]["translation_m"] = [at[0], at[1], at[2] + 1.0]  # type: ignore[index]
+    for number, row in enumerate(sensors):
+        x, y, z = row["extrinsics"]["translation_m"]  # type: ignore[index]
+        away_m = APART_M * number if scene == "apart" else 0.0
+        at = [x, y + away_m, z + (1.0 if scene == "street" else 0.0)]
+        row["extrinsics"]["translation_m"] = at  # type: ignore[index]
     found["motion"]["standstill_s"] = STANDSTILL_S  # type: ignore[index]
     found |= {"sensors": sensors, "seed": 100 + rig, "duration_s": DURATION_S}
     found.pop("imu", None)
@@ -260,7 +261,7 @@ def main(arguments: list[str]) -> None:
     """Simulate or run."""
     folder, what, *rest = arguments
     if what == "make":
-        for scene in rest or [*SCENES, *DEGENERATE, "apart"]:
+        for scene in rest or [*SCENES, *DEGENERATE]:
             for rig in range(3):
                 make(Path(folder), scene, rig)
     else:
