@@ -27,6 +27,7 @@ from mlbatch.poses.solve import (
     Problem,
     Solution,
     State,
+    better_start,
     find_poses,
     moved,
     solve,
@@ -243,10 +244,31 @@ def calibrated(
     delays: also solve for the delay of each lidar; guess: corrections to begin with, else none.
     Raises RecordingError with the reason where the recording does not determine them.
     """
-    fitted, held_out = places.fitted(), places.held_out()
     _refuse_few(places, names)
     begin = guess or State.start(len(names), 0)
+    fitted = places.fitted()
     found = find_poses(fitted, len(names), delays=delays, guess=_start(begin, len(fitted)))
+    try:
+        return _measured(places, names, poses, begin, found, delays=delays)
+    except RecordingError:
+        better = better_start(fitted, found.state)
+        if better is None:
+            raise
+    found = find_poses(fitted, len(names), delays=delays, guess=better)
+    return _measured(places, names, poses, begin, found, delays=delays)
+
+
+def _measured(
+    places: Places,
+    names: Sequence[str],
+    poses: Sequence[F64Array],
+    begin: State,
+    found: Solution,
+    *,
+    delays: bool,
+) -> Calibration:
+    """What was found from a guess, measured on the places that were left out."""
+    fitted, held_out = places.fitted(), places.held_out()
     _refuse_unseen(found, names)
     _refuse_undetermined(found, names, delays=delays)
     if not delays:

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import combinations
+from itertools import combinations, product
 
 import numpy as np
 
@@ -111,6 +111,12 @@ _SEARCH = (
     Level(0.5, 0.94, 0.4, 40_000, 1),
     Level(0.25, 0.97, 0.15, 60_000, 3),
 )
+# Of a search that ended badly: turns about z that others begin with; places that these look at;
+# surfaces that agree; how many more of them make a start better.
+_TURNS_RAD = np.deg2rad([-20.0, -10.0, 10.0, 20.0])
+_MOST_TRIED = 4
+_AGREES = Level(1.0, 0.94, 0.1)
+_MORE = 1.05
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -343,6 +349,45 @@ def find_poses(
     return solve(Problem(places, lidars, delays=delays), state, fine)
 
 
+def better_start(places: Sequence[Place], end: State) -> State | None:
+    """A start from which more surfaces agree than where a search ended, or None.
+
+    A floor draws lidars to itself at any turn about z, and with them beyond the reach of walls.
+    """
+    step = -(-len(places) // _MOST_TRIED)
+    problem = Problem(places[::step], len(end.corrections))
+    best = State(end.corrections, end.twists[::step], end.delay_s)
+    first = most = _agreeing(problem, best)
+    turns = [(0.0, 1), *product(_TURNS_RAD.tolist(), range(1, problem.lidars))]
+    for turn_rad, lidar in turns:
+        rotation = exp_rotation(np.array([[0.0, 0.0, turn_rad]]))[0]
+        corrections = list(best.corrections)
+        corrections[lidar] = _after_move(corrections[lidar], Pose(rotation, np.zeros(3)))
+        start = State(corrections, best.twists, best.delay_s)
+        state = solve(problem, start, _SEARCH[0]).state
+        agreeing = _agreeing(problem, state)
+        if agreeing > most:
+            best, most = state, agreeing
+    if most <= _MORE * first:
+        return None
+    return State(best.corrections, np.zeros((len(places), 6)), best.delay_s)
+
+
+def _agreeing(problem: Problem, state: State) -> int:
+    """Number of surfaces and stems of different lidars that agree."""
+    return sum(
+        int((rows.pair[:, 0] != rows.pair[:, 1]).sum()) for rows in problem.rows(state, _AGREES)
+    )
+
+
+def _after_move(pose: Pose, move: Pose) -> Pose:
+    """A correction, and then a motion."""
+    return Pose(
+        np.matmul(move.rotation, pose.rotation),
+        np.matmul(move.rotation, pose.position_m) + move.position_m,
+    )
+
+
 def _follow_votes(problem: Problem, state: State) -> bool:
     """Move each lidar whose stems meet those of the others elsewhere; whether there was one."""
     followed = False
@@ -354,13 +399,10 @@ def _follow_votes(problem: Problem, state: State) -> bool:
             first = {cloud.lidar: stems for cloud, stems in reversed([*found]) if stems is not None}
             mine = [stems for other, stems in first.items() if other == lidar]
             sides.append((mine, [stems for other, stems in first.items() if other != lidar]))
-        move, pose = best_move(sides), state.corrections[lidar]
+        move = best_move(sides)
         if move is not ORIGIN:
             followed = True
-            state.corrections[lidar] = Pose(
-                np.matmul(move.rotation, pose.rotation),
-                np.matmul(move.rotation, pose.position_m) + move.position_m,
-            )
+            state.corrections[lidar] = _after_move(state.corrections[lidar], move)
     return followed
 
 
@@ -388,11 +430,8 @@ def _after(problem: Problem, state: State, step: F64Array) -> State:
     delay_s = state.delay_s.copy()
     parts = _shortened(step[: problem.poses].reshape(-1, problem.each), _LONGEST_M, _LONGEST_RAD)
     for lidar, part in enumerate(parts, 1):
-        pose = corrections[lidar]
-        turn = exp_rotation(part[None, 3:6])[0]
-        corrections[lidar] = Pose(
-            np.matmul(turn, pose.rotation), np.matmul(turn, pose.position_m) + part[:3]
-        )
+        move = Pose(exp_rotation(part[None, 3:6])[0], part[:3])
+        corrections[lidar] = _after_move(corrections[lidar], move)
         if problem.each == 7:
             delay_s[lidar] += part[6]
     twists = _shortened(step[problem.poses :].reshape(-1, 6), _LONGEST_MPS, _LONGEST_RADPS)

@@ -8,7 +8,16 @@ import pytest
 from mlbatch.arrays import F64Array
 from mlbatch.motion.registration import ORIGIN, Pose
 from mlbatch.motion.se3 import exp_transform, log_rotation
-from mlbatch.poses.solve import FINE, Problem, Solution, State, find_poses, moved, solve
+from mlbatch.poses.solve import (
+    FINE,
+    Problem,
+    Solution,
+    State,
+    better_start,
+    find_poses,
+    moved,
+    solve,
+)
 from tests.poses.clouds import CORRIDOR, END, GROUND, ROOM, WALL, Face, Rig, motion
 
 TWIST = np.array([1.2, 0.3, -0.1, 0.05, -0.04, 0.5])
@@ -118,6 +127,30 @@ def test_lidars_that_see_nothing_in_common_leave_all_open() -> None:
         assert found.weak.shape == (6, 6)
         assert (0, 1) not in found.matched
         assert np.diag(found.covariance)[:3].min() > 0.5
+
+
+def test_a_search_that_ends_badly_begins_elsewhere() -> None:
+    """A guess near 20 degrees and 1 m, from which the walls at the ends of a room are missed."""
+    rig = Rig((ORIGIN, motion((-0.72, -0.62, -0.31), (12, -16, 3))), TWIST)
+    rng = np.random.default_rng(3)
+    places = [rig.place(rng, (ROOM, ROOM), 9000) for _ in range(2)]
+    ended = find_poses(places, 2)
+    assert ended.weak.shape == (6, 1)
+    better = better_start(places, ended.state)
+    assert better is not None
+    found = find_poses(places, 2, guess=better)
+    assert found.weak.shape == (6, 0)
+    assert np.abs(errors(rig, found)[0, :3]).max() < 0.003
+    assert better_start(places, found.state) is None
+
+
+@pytest.mark.parametrize("faces", [CORRIDOR, (GROUND,)])
+def test_no_start_determines_what_the_scene_leaves_open(faces: tuple[Face, ...]) -> None:
+    rig = Rig((ORIGIN, motion((-0.72, -0.62, -0.31), (12, -16, 3))), TWIST)
+    rng = np.random.default_rng(4)
+    places = [rig.place(rng, (faces, faces), 9000) for _ in range(2)]
+    better = better_start(places, State.start(2, 2))
+    assert find_poses(places, 2, guess=better).weak.shape[1] > 0
 
 
 def test_without_points_all_is_open() -> None:
