@@ -11,17 +11,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from mlbatch.arrays import F64Array
-from mlbatch.page.document import COLOURS
-from mlbatch.page.instant import HEAD as INSTANT_HEAD
-from mlbatch.page.instant import (
-    SharedInstant,
-    about,
-    ages_plot,
-    direction_plots,
-    place_words,
-    toggle,
-)
-from mlbatch.page.instant import rows as instant_rows
+from mlbatch.page.instant import SharedInstant
 from mlbatch.page.policies import (
     DEFAULT_MPS,
     KMH_PER_MPS,
@@ -30,7 +20,7 @@ from mlbatch.page.policies import (
     offset_m,
     quantile,
 )
-from mlbatch.page.templates import Verdict, asset, page_json, render
+from mlbatch.page.templates import Verdict, render
 
 _WIDTH = 900
 _HEIGHT = 300
@@ -64,32 +54,22 @@ def comparison_page(
     speed_mps: float = DEFAULT_MPS,
 ) -> str:
     """The whole page; policies: windows last; speed_mps: of an object."""
-    clouds = [] if instant is None else instant.clouds()
-    ticks = [] if instant is None else _age_ticks(*instant.range_ms)
-    player = {}
-    if instant is not None and clouds:
-        player = {
-            "data": page_json(toggle(instant, clouds)),
-            "script": "".join(map(asset, ("viewer.js", "player.js", "comparison.js"))),
-        }
+    values: dict[str, object] = {"clouds": []}
+    if instant is not None:
+        oldest_ms, newest_ms = instant.range_ms
+        step = nice_step(oldest_ms - newest_ms, 6)
+        first, last = math.ceil(newest_ms / step), math.floor(oldest_ms / step)
+        ticks = [step * number for number in range(first, last + 1)]
+        values |= instant.values(speed_mps, ticks)
     return render(
         "comparison.html",
         title=title,
         verdict=_verdict(summary, policies, speed_mps),
-        **player,
+        **values,
         instant=instant,
-        clouds=clouds,
-        colours=COLOURS,
-        lidars=[] if instant is None else _legend(instant.sensors),
-        about=about(instant, clouds) if instant is not None and clouds else "",
-        place=place_words(instant, speed_mps) if instant is not None and clouds else "",
-        instant_head=INSTANT_HEAD,
-        instant_rows=[] if instant is None else instant_rows(instant, speed_mps),
-        ages={} if instant is None else ages_plot(instant, ticks),
-        directions=[] if instant is None else direction_plots(instant, ticks),
         speed=f"{speed_mps:g} m/s",
         notes=notes,
-        names=_legend([one.name for one in policies]),
+        names=[(_kind(number), one.name) for number, one in enumerate(policies)],
         width=_WIDTH,
         left=_LEFT,
         right=_WIDTH - _RIGHT,
@@ -102,12 +82,6 @@ def comparison_page(
         rows=list(map(_row, policies)),
         command=command,
     )
-
-
-def _age_ticks(oldest_ms: float, newest_ms: float) -> list[float]:
-    step = nice_step(oldest_ms - newest_ms, 6)
-    first, last = math.ceil(newest_ms / step), math.floor(oldest_ms / step)
-    return [step * number for number in range(first, last + 1)]
 
 
 def _verdict(summary: str, policies: Policies, speed_mps: float) -> Verdict:
@@ -136,10 +110,6 @@ def _verdict(summary: str, policies: Policies, speed_mps: float) -> Verdict:
 def _kind(number: int) -> str:
     """The class of a policy in the style sheet."""
     return f"k{number % 4}"
-
-
-def _legend(names: Sequence[str]) -> list[tuple[str, str]]:
-    return [(_kind(number), name) for number, name in enumerate(names)]
 
 
 def nice_step(span: float, count: int) -> float:

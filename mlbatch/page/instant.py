@@ -6,70 +6,113 @@ import base64
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
-from mlbatch.arrays import F64Array, I64Array
+from mlbatch.arrays import BoolArray, F32Array, F64Array, I64Array, U8Array, U16Array
 from mlbatch.outputs.stored_scan import StoredScan
 from mlbatch.page.clouds import MOST_CHARS
-from mlbatch.page.document import cloud_data, kept_words
+from mlbatch.page.document import COLOURS, cloud_data, kept_words
 from mlbatch.page.points import PageCloud, Place, joined_cloud
 from mlbatch.page.policies import offset_m
+from mlbatch.page.templates import asset, page_json
 from mlbatch.units import NS_PER_MS
 
 # Ages are drawn by direction, deg; nearer points have none that lidars share, m.
 _SECTOR_DEG = 5
 _NEAREST_M = 2.0
-# From the camera to the place, in radii of it.
-_CAMERA = 5.0
+# Of the circle around a spot, and from the camera to it, m.
+RADIUS_M = 2.5
+_CAMERA_M = 12.5
 # Of the plots, in pixels.
-_LEFT, _WIDTH, _HEIGHT, _LANE = 56, 900, 200, 14
-HEAD = (
+_LEFT, _RIGHT, _HEIGHT, _LANE = 56, 888, 200, 14
+_HEAD = (
     *("set", "age, ms", "lidars apart at the place, ms", "offset there, m"),
     *("apart at all places: median, ms", "largest, ms", "largest offset, m"),
 )
+
+
+class SetPoints(NamedTuple):
+    """Points of a set, (n, 3) m, body frame, and (n,); time_ns: after the instant."""
+
+    xyz: F32Array
+    lidar: U8Array
+    time_ns: I64Array
+    ring: U16Array
+    intensity: F32Array
+
+    def take(self, rows: BoolArray | I64Array) -> SetPoints:
+        """Some of the points."""
+        xyz, lidar, time_ns, ring, intensity = self
+        return SetPoints(xyz[rows], lidar[rows], time_ns[rows], ring[rows], intensity[rows])
 
 
 @dataclass(frozen=True, slots=True)
 class Spot:
     """The place where a fused set differs most from the window; centre_m: body frame.
 
-    unmatched: points of the fused set, of `points` above the ground, without a point of the window
-    near them; 0: only the times differ.
+    gain_ns: time between the lidars in the fused set, beyond that in the window; unmatched: points
+    of the fused set, of `points` above the ground, without a point of the window near them; 0: only
+    the times differ.
     """
 
     centre_m: tuple[float, float, float]
-    radius_m: float
+    gain_ns: float
     unmatched: int
     points: int
+
+    @property
+    def score(self) -> tuple[bool, float]:
+        """What differs in place precedes what differs in time."""
+        return self.unmatched > 0, self.gain_ns * max(1, self.unmatched)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class InstantSet:
     """A fused set, or the window; ages in ms before the instant, by lidar; None: no column.
 
-    ages_ms: oldest and newest column; cloud: its `time_ns` after the instant, None: no poses;
-    spot_ms: mean of the points at the spot; apart_ms: between the lidars at places that two see,
-    median and largest.
+    ages_ms: oldest and newest column; points: None: no poses; spot_ms: time between the lidars at
+    the spot, None if fewer than two see it; apart_ms: at all places that two see, median and
+    largest.
     """
 
     name: str
     ages_ms: tuple[tuple[float, float] | None, ...]
-    cloud: StoredScan | None = None
-    spot_ms: tuple[float | None, ...] = ()
+    points: SetPoints | None = None
+    spot_ms: float | None = None
     apart_ms: tuple[float, float] | None = None
 
     @property
     def range_ms(self) -> tuple[float, float]:
         """Age of its oldest and newest column."""
-        known = [ages for ages in self.ages_ms if ages is not None]
-        return max(oldest for oldest, _ in known), min(newest for _, newest in known)
+        oldest, newest = zip(*(ages for ages in self.ages_ms if ages is not None), strict=True)
+        return max(oldest), min(newest)
 
-    @property
-    def spot_apart_ms(self) -> float | None:
-        """Time between the lidars at the spot; None if fewer than two see it."""
-        known = [age for age in self.spot_ms if age is not None]
-        return max(known) - min(known) if len(known) > 1 else None
+    def row(self, speed_mps: float) -> list[str]:
+        """Cells of the table."""
+        oldest, newest = self.range_ms
+        apart = ["-"] * 5
+        if self.spot_ms is not None:
+            apart[:2] = f"{self.spot_ms:.1f}", f"{offset_m(speed_mps, self.spot_ms):.2f}"
+        if self.apart_ms is not None:
+            largest = offset_m(speed_mps, self.apart_ms[1])
+            apart[2:] = *(f"{one:.1f}" for one in self.apart_ms), f"{largest:.2f}"
+        return [self.name, f"{oldest:.1f} to {newest:.1f}", *apart]
+
+    def ages_by_direction(self, lidar: int) -> list[tuple[float, float]]:
+        """Azimuth in the body frame, deg, and median age, ms, of sectors with points of a lidar."""
+        if self.points is None:
+            return []
+        x, y = self.points.xyz[:, 0], self.points.xyz[:, 1]
+        own = np.flatnonzero((np.hypot(x, y) > _NEAREST_M) & (self.points.lidar == lidar))
+        azimuth_deg = np.degrees(np.arctan2(y[own], x[own]))
+        sector = np.floor(azimuth_deg / _SECTOR_DEG).astype(np.int64)
+        age_ms = -self.points.time_ns[own] / NS_PER_MS
+        return [
+            ((number + 0.5) * _SECTOR_DEG, float(np.median(age_ms[sector == number])))
+            for number in np.unique(sector).tolist()
+        ]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -99,203 +142,153 @@ class SharedInstant:
 
     def clouds(self) -> list[PageCloud]:
         """The sets as a page stores them; every nth column where they would be too large."""
-        stored = [one.cloud for one in self.sets if one.cloud is not None]
         stride = 1
         while True:
-            clouds = [self._cloud(number, one, stride) for number, one in enumerate(stored)]
+            clouds = [
+                self._cloud(one.name, one.points, stride)
+                for one in self.sets
+                if one.points is not None
+            ]
             share = sum(one.chars for one in clouds) / MOST_CHARS
             if share <= 1:
                 return clouds
             stride = math.ceil(stride * share)
 
-    def _cloud(self, number: int, cloud: StoredScan, stride: int) -> PageCloud:
-        place = Place(self.sets[number].name, number, number, 0, 0)
+    def _cloud(self, name: str, points: SetPoints, stride: int) -> PageCloud:
+        xyz, lidar, time_ns, ring, intensity = points
+        scan = StoredScan(
+            *("", 0, xyz, False), lidar_id=lidar, time_ns=time_ns, ring=ring, intensity=intensity
+        )
         first_ns, last_ns = (round(-age * NS_PER_MS) for age in self.range_ms)
-        return joined_cloud(
-            place, [cloud], self.period_ns, self.columns, stride, times_ns=(first_ns, last_ns)
-        )
+        place = Place(name, 0, 0, 0, 0)
+        times_ns = first_ns, last_ns
+        return joined_cloud(place, [scan], self.period_ns, self.columns, stride, times_ns=times_ns)
 
+    def values(self, speed_mps: float, ticks: Sequence[float]) -> dict[str, object]:
+        """Values of the template; speed_mps: of an object; ticks: ages of the plots, ms."""
+        values: dict[str, object] = {
+            "lidars": [(f"k{number % 4}", name) for number, name in enumerate(self.sensors)],
+            "ages": self._ages_plot(ticks),
+        }
+        clouds = self.clouds()
+        if not clouds:
+            return values
+        return values | {
+            "clouds": clouds,
+            "colours": COLOURS,
+            "about": self._about(clouds),
+            "place": self.place_words(speed_mps),
+            "table": (_HEAD, [one.row(speed_mps) for one in self.sets]),
+            "directions": self._direction_plots(ticks),
+            "data": page_json(self._toggle(clouds)),
+            "script": "".join(map(asset, ("viewer.js", "player.js", "comparison.js"))),
+        }
 
-def toggle(instant: SharedInstant, clouds: Sequence[PageCloud]) -> dict[str, object]:
-    """The data of the player."""
-    spot = instant.spot
-    return {
-        "sensors": instant.sensors,
-        "poses": [pose[:3].ravel().tolist() for pose in instant.poses],
-        "begin": instant.shown,
-        "pair": [instant.shown, len(clouds) - 1],
-        "colour": "time",
-        "spot": None
-        if spot is None
-        else {
-            "target": spot.centre_m,
-            "radius": spot.radius_m,
-            "distance": _CAMERA * spot.radius_m,
-            # As the body looks at it.
-            "yaw": math.atan2(spot.centre_m[1], spot.centre_m[0]),
-        },
-        "clouds": [
-            # The caption begins with the title.
-            cloud_data(replace(one, place=Place("", 0, 0, 0, 0)), 0.0)
-            | {"title": one.place.title, "ages": True}
-            | {"data": base64.b64encode(one.packed).decode()}
-            for one in clouds
-        ],
-    }
+    # -- words --------------------------------------------------------------------------------
 
-
-def about(instant: SharedInstant, clouds: Sequence[PageCloud]) -> str:
-    """What the clouds are, in words."""
-    kilobytes = sum(one.chars for one in clouds) / len(clouds) / 1000
-    return (
-        f"The end of a window, {instant.at_s:.1f} s after the first column: the one of "
-        f"{instant.looked} instants at which a fused set differs most from the window. Of each "
-        f"policy the set whose last column is nearest, with {kept_words(clouds[0])}; "
-        f"{kilobytes:,.0f} kB per cloud. Age: time before the instant, negative after it."
-    )
-
-
-def place_words(instant: SharedInstant, speed_mps: float) -> str:
-    """What differs at the place, and how far apart an object stands there."""
-    fused, window = instant.sets[instant.shown], instant.sets[-1]
-    spot = instant.spot
-    if spot is None:
+    def _about(self, clouds: Sequence[PageCloud]) -> str:
+        kilobytes = sum(one.chars for one in clouds) / len(clouds) / 1000
         return (
-            "At no place are the lidars of a fused set farther apart in time than those of the "
-            "window by 5 ms or more."
+            f"The end of a window, {self.at_s:.1f} s after the first column: the one of "
+            f"{self.looked} instants at which a fused set differs most from the window. Of each "
+            f"policy the set whose last column is nearest, with {kept_words(clouds[0])}; "
+            f"{kilobytes:,.0f} kB per cloud. Age: time before the instant, negative after it."
         )
-    text = "In the circle the times of the lidars differ most."
-    if spot.unmatched:
-        text = (
-            f"In the circle the clouds differ most: {spot.unmatched:,} of {spot.points:,} points "
-            "of the fused set above the ground have no point of the window near them, since "
-            "something moves there, or the body itself."
+
+    def place_words(self, speed_mps: float) -> str:
+        """What differs at the place, and how far apart an object stands there."""
+        fused, window, spot = self.sets[self.shown], self.sets[-1], self.spot
+        if spot is None or fused.spot_ms is None:
+            return (
+                "At no place are the lidars of a fused set farther apart in time than those of the "
+                "window by 5 ms or more."
+            )
+        text = "In the circle the times of the lidars differ most."
+        if spot.unmatched:
+            text = (
+                f"In the circle the clouds differ most: {spot.unmatched:,} of {spot.points:,} "
+                "points of the fused set above the ground have no point of the window near them, "
+                "since something moves there, or the body itself."
+            )
+        other = "one lidar alone sees it"
+        if window.spot_ms is not None:
+            other = f"{offset_m(speed_mps, window.spot_ms):.2f} m ({window.spot_ms:.0f} ms)"
+        return (
+            f"{text} There an object at {speed_mps:g} m/s stands at two places "
+            f"{offset_m(speed_mps, fused.spot_ms):.2f} m apart ({fused.name}: {fused.spot_ms:.0f} "
+            f"ms between the lidars); in the window: {other}."
         )
-    apart_ms = fused.spot_apart_ms
-    if apart_ms is None:
-        return text
-    offset = f"{offset_m(speed_mps, apart_ms):.2f} m"
-    window_ms = window.spot_apart_ms
-    other = "one lidar alone sees it" if window_ms is None else _offset(speed_mps, window_ms)
-    return (
-        f"{text} There an object at {speed_mps:g} m/s stands at two places {offset} apart "
-        f"({fused.name}: {apart_ms:.0f} ms between the lidars); in the window: {other}."
-    )
 
+    # -- data and plots -----------------------------------------------------------------------
 
-def _offset(speed_mps: float, time_ms: float) -> str:
-    return f"{offset_m(speed_mps, time_ms):.2f} m ({time_ms:.0f} ms)"
-
-
-def rows(instant: SharedInstant, speed_mps: float) -> list[list[str]]:
-    """Cells of the table, as HEAD."""
-    found = []
-    for one in instant.sets:
-        oldest, newest = one.range_ms
-        spot_ms = one.spot_apart_ms
-        cells = [one.name, f"{oldest:.1f} to {newest:.1f}", "-", "-", "-", "-", "-"]
-        if spot_ms is not None:
-            cells[2:4] = f"{spot_ms:.1f}", f"{offset_m(speed_mps, spot_ms):.2f}"
-        if one.apart_ms is not None:
-            median_ms, most_ms = one.apart_ms
-            offset = f"{offset_m(speed_mps, most_ms):.2f}"
-            cells[4:] = f"{median_ms:.1f}", f"{most_ms:.1f}", offset
-        found.append(cells)
-    return found
-
-
-# -- plots ------------------------------------------------------------------------------------
-
-
-def ages_plot(instant: SharedInstant, ticks: Sequence[float]) -> dict[str, object]:
-    """Bars from the oldest to the newest column of each lidar; ticks: ages, ms."""
-    oldest, newest = instant.range_ms
-    scale = (_WIDTH - 2 * _LEFT) / (oldest - newest)
-
-    def x(age_ms: float) -> float:
-        return _LEFT + (oldest - age_ms) * scale
-
-    sets = []
-    y = 4
-    for one in instant.sets:
-        bars = []
-        for number, ages in enumerate(one.ages_ms):
-            if ages is not None:
-                name = instant.sensors[number]
-                text = f"{one.name}, {name}: {ages[0]:.1f} to {ages[1]:.1f} ms before the instant"
-                bar_y = y + 18 + number * _LANE
-                bars.append(
-                    (f"k{number % 4}", x(ages[0]), (ages[0] - ages[1]) * scale, bar_y, text)
-                )
-        first, last = one.range_ms
-        sets.append((y + 13, f"{one.name}: {first - last:.0f} ms", bars))
-        y += 28 + _LANE * len(instant.sensors)
-    return {
-        "height": y + 20,
-        "sets": sets,
-        "lane": _LANE - 3,
-        "ticks": [(x(tick), f"{tick:g} ms") for tick in ticks if newest <= tick <= oldest],
-    }
-
-
-def direction_plots(instant: SharedInstant, ticks: Sequence[float]) -> list[dict[str, object]]:
-    """Ages by direction, one plot per set; ticks: ages, ms."""
-    oldest, newest = instant.range_ms
-    inner = _WIDTH - _LEFT - 12
-
-    def y(age_ms: float) -> float:
-        return 14 + (oldest - age_ms) / (oldest - newest) * (_HEIGHT - 48)
-
-    return [
-        {
-            "name": one.name,
-            "height": _HEIGHT,
-            "axis": {"unit": "ms", "ticks": [(y(tick), f"{tick:g}") for tick in ticks]},
-            "directions": [
-                (
-                    _LEFT + (degrees + 180) / 360 * inner,
-                    "end" if degrees == 180 else "middle",
-                    f"{degrees} deg",
-                )
-                for degrees in range(-180, 181, 60)
-            ],
-            "paths": [
-                (
-                    f"k{number % 4}",
-                    instant.sensors[number],
-                    "".join(
-                        f"M{_LEFT + (at + 180 - 2) / 360 * inner:.1f} {y(age):.1f}h{inner / 90:.1f}"
-                        for at, age in ages
-                    ),
-                )
-                for number, ages in enumerate(ages_by_direction(one.cloud, len(instant.sensors)))
+    def _toggle(self, clouds: Sequence[PageCloud]) -> dict[str, object]:
+        """The data of the player."""
+        spot = self.spot and {
+            "target": self.spot.centre_m,
+            "radius": RADIUS_M,
+            "distance": _CAMERA_M,
+            # As the body looks at it.
+            "yaw": math.atan2(self.spot.centre_m[1], self.spot.centre_m[0]),
+        }
+        return {
+            "sensors": self.sensors,
+            "poses": [pose[:3].ravel().tolist() for pose in self.poses],
+            "begin": self.shown,
+            "pair": [self.shown, len(clouds) - 1],
+            "colour": "time",
+            "spot": spot,
+            "clouds": [
+                # The caption begins with the title.
+                cloud_data(replace(one, place=replace(one.place, title="")), 0.0)
+                | {"title": one.place.title, "ages": True}
+                | {"data": base64.b64encode(one.packed).decode()}
+                for one in clouds
             ],
         }
-        for one in instant.sets
-        if one.cloud is not None
-    ]
 
+    def _ages_plot(self, ticks: Sequence[float]) -> dict[str, object]:
+        """Bars from the oldest to the newest column of each lidar."""
+        oldest, newest = self.range_ms
+        scale = (_RIGHT - 2 * _LEFT) / (oldest - newest)
+        height = 28 + _LANE * len(self.sensors)
+        sets = []
+        for row, one in enumerate(self.sets):
+            bars = []
+            for number, (name, ages) in enumerate(zip(self.sensors, one.ages_ms, strict=True)):
+                if ages is not None:
+                    first, last = ages
+                    text = f"{one.name}, {name}: {first:.1f} to {last:.1f} ms before the instant"
+                    x, y = _LEFT + (oldest - first) * scale, row * height + 22 + number * _LANE
+                    bars.append((f"k{number % 4}", x, (first - last) * scale, y, text))
+            first, last = one.range_ms
+            sets.append((row * height + 17, f"{one.name}: {first - last:.0f} ms", bars))
+        return {
+            "height": len(self.sets) * height + 24,
+            "sets": sets,
+            "lane": _LANE - 3,
+            "ticks": [(_LEFT + (oldest - tick) * scale, f"{tick:g} ms") for tick in ticks],
+        }
 
-def ages_by_direction(cloud: StoredScan, sensors: int) -> list[list[tuple[float, float]]]:
-    """Azimuth in the body frame, deg, and median age, ms, of sectors with points, by lidar."""
-    if cloud.time_ns is None or cloud.lidar_id is None:
-        return []
-    x, y = cloud.xyz[:, 0], cloud.xyz[:, 1]
-    far = np.hypot(x, y) > _NEAREST_M
-    sector = np.floor(np.degrees(np.arctan2(y, x)) / _SECTOR_DEG).astype(np.int64)
-    found = []
-    for number in range(sensors):
-        own = np.flatnonzero(far & (cloud.lidar_id == number))
-        order = own[np.argsort(sector[own], kind="stable")]
-        edges = np.flatnonzero(np.diff(sector[order]))
-        found.append(
-            [
-                (
-                    (float(sector[some[0]]) + 0.5) * _SECTOR_DEG,
-                    -float(np.median(cloud.time_ns[some])) / NS_PER_MS,
-                )
-                for some in np.split(order, edges + 1)
-                if len(some)
-            ]
-        )
-    return found
+    def _direction_plots(self, ticks: Sequence[float]) -> list[dict[str, object]]:
+        """Ages by direction, one plot per set."""
+        oldest, newest = self.range_ms
+
+        def x(degrees: float) -> float:
+            return _LEFT + (degrees + 180) / 360 * (_RIGHT - _LEFT)
+
+        def y(age_ms: float) -> float:
+            return 14 + (oldest - age_ms) / (oldest - newest) * (_HEIGHT - 48)
+
+        length = x(_SECTOR_DEG) - x(1)
+        plots = []
+        for one in self.sets:
+            paths = []
+            for number, name in enumerate(self.sensors):
+                ages = one.ages_by_direction(number)
+                path = "".join(f"M{x(at - 2):.1f} {y(age):.1f}h{length:.1f}" for at, age in ages)
+                paths.append((f"k{number % 4}", name, path))
+            plots.append({"name": one.name, "paths": paths})
+        axis = {"unit": "ms", "ticks": [(y(tick), f"{tick:g}") for tick in ticks]}
+        directions = [(x(degrees), f"{degrees} deg") for degrees in range(-180, 180, 60)]
+        shared = {"height": _HEIGHT, "axis": axis, "directions": directions}
+        return [plot | shared for plot in plots]

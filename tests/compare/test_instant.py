@@ -14,9 +14,9 @@ import pytest
 import mlbatch
 from mlbatch.arrays import F32Array, F64Array, U8Array
 from mlbatch.compare.compare import WINDOWS, Comparison, compare
-from mlbatch.compare.places import Points, apart, difference
+from mlbatch.compare.places import apart, cells, difference
 from mlbatch.discovery.discover import SensorSelection
-from mlbatch.page.instant import InstantSet, SharedInstant, place_words, rows
+from mlbatch.page.instant import InstantSet, SetPoints, SharedInstant
 from mlbatch.pipeline.job import Job
 from tests.builders.simulated import Recorded, record, scenario_text
 
@@ -89,11 +89,10 @@ def test_the_car_is_found_where_it_stands_twice(instant: SharedInstant) -> None:
     assert abs(spot.centre_m[1] - CAR_Y_M) < 1
     # Half of the directions are a period apart; the lidars, 2 m apart, look at a car at 7 m in
     # directions that differ by less than 17 deg: 5 ms.
-    assert fused.spot_apart_ms == pytest.approx(100, abs=5)
-    assert window.spot_apart_ms == pytest.approx(0, abs=5)
-    assert "stands at two places 1.0" in place_words(instant, 10)
-    cells = {row[0]: row for row in rows(instant, 5)}
-    assert float(cells[fused.name][3]) == pytest.approx(0.5, abs=0.03)
+    assert fused.spot_ms == pytest.approx(100, abs=5)
+    assert window.spot_ms == pytest.approx(0, abs=5)
+    assert "stands at two places 1.0" in instant.place_words(10)
+    assert float(fused.row(5)[3]) == pytest.approx(0.5, abs=0.03)
 
 
 def test_points_of_the_car_are_where_it_was_at_their_age(instant: SharedInstant) -> None:
@@ -150,34 +149,30 @@ def test_without_extrinsics_ages_are_left(opposed: Recorded, instant: SharedInst
 
 
 def _arrays(one: InstantSet) -> tuple[F32Array, U8Array, F64Array]:
-    cloud = one.cloud
-    assert cloud is not None
-    assert cloud.lidar_id is not None
-    assert cloud.time_ns is not None
-    return cloud.xyz, cloud.lidar_id, np.divide(cloud.time_ns, -1e9)
+    points = one.points
+    assert points is not None
+    return points.xyz, points.lidar, np.divide(points.time_ns, -1e9)
 
 
 # -- places, by hand --------------------------------------------------------------------------
 
 
-def _wall(x_m: float, time_ms: float, lidar: int, *, shift_m: float = 0.0) -> Points:
+def _wall(x_m: float, time_ms: float, lidar: int, *, shift_m: float = 0.0) -> SetPoints:
     """A wall of 1.6 m by 2 m at x, y 10.2 m, points 0.1 m and 0.08 m apart."""
     along, up = np.meshgrid(np.arange(0.2, 1.8, 0.1), np.arange(0, 2, 0.08))
     xyz = np.stack([x_m + along.ravel(), np.full(along.size, 10.2 + shift_m), up.ravel()], 1)
     count = len(xyz)
-    return Points(
+    return SetPoints(
         xyz.astype(np.float32),
         np.full(count, lidar, np.uint8),
         np.full(count, round(time_ms * 1e6), np.int64),
+        np.zeros(count, np.uint16),
+        np.zeros(count, np.float32),
     )
 
 
-def _all(*parts: Points) -> Points:
-    return Points(
-        np.concatenate([part.xyz for part in parts]),
-        np.concatenate([part.lidar for part in parts]),
-        np.concatenate([part.time_ns for part in parts]),
-    )
+def _all(*parts: SetPoints) -> SetPoints:
+    return SetPoints(*map(np.concatenate, zip(*parts, strict=True)))
 
 
 PERIOD_NS = 100_000_000
@@ -185,13 +180,13 @@ PERIOD_NS = 100_000_000
 
 def test_times_between_lidars_by_place() -> None:
     points = _all(_wall(0, -60, 0), _wall(0, -20, 1), _wall(4, -10, 0))
-    found = apart(points, points.cells(), PERIOD_NS)
+    found = apart(points, cells(points), PERIOD_NS)
     assert found.apart_ns.tolist() == [40e6, 0]
     assert found.lidars.tolist() == [2, 1]
     assert found.shared_ms() == (40, 40)
     # A place that a lidar saw at the start and the end of a revolution has no time of its own.
     seam = _all(points, _wall(0, -95, 0))
-    assert apart(seam, seam.cells(), PERIOD_NS).lidars.tolist() == [1]
+    assert apart(seam, cells(seam), PERIOD_NS).lidars.tolist() == [1]
 
 
 def test_what_moves_is_found_before_what_is_stale() -> None:

@@ -13,10 +13,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mlbatch.outputs.stored_scan import StoredScan
 from mlbatch.page import write_text_page
 from mlbatch.page.comparison import binned, comparison_page, nice_step
-from mlbatch.page.instant import InstantSet, SharedInstant, Spot, place_words
+from mlbatch.page.instant import InstantSet, SetPoints, SharedInstant, Spot
 from mlbatch.page.policies import PolicyFigures, offset_m, quantile
 from tests.page.browser import CHROMIUM, NO_CHROMIUM, Browser, browser
 
@@ -61,12 +60,13 @@ def _set(name: str, oldest_ms: float, *, has_cloud: bool = True) -> InstantSet:
     lidar = (np.arange(len(turn)) % 2).astype(np.uint8)
     time_ns = np.linspace(-1e8, 0, len(turn)).astype(np.int64)
     time_ns[lidar == 1] -= round((oldest_ms - 100) * 1e6)
-    cloud = StoredScan("", 0, xyz, organized=False, time_ns=time_ns, lidar_id=lidar)
+    intensity = np.zeros(len(turn), np.float32)
+    points = SetPoints(xyz, lidar, time_ns, lidar.astype(np.uint16), intensity)
     ages_ms = ((100.0, 0.0), (oldest_ms, oldest_ms - 100))
-    spot_ms = (50.0, oldest_ms - 50)
     if not has_cloud:
         return InstantSet(name, ages_ms)
-    return InstantSet(name, ages_ms, cloud, spot_ms, (oldest_ms - 100, oldest_ms - 100))
+    apart_ms = oldest_ms - 100
+    return InstantSet(name, ages_ms, points, apart_ms, (apart_ms, apart_ms))
 
 
 def _instant(name: str = "latest sweeps", *, has_clouds: bool = True) -> SharedInstant:
@@ -82,7 +82,7 @@ def _instant(name: str = "latest sweeps", *, has_clouds: bool = True) -> SharedI
             for one, oldest_ms in ((name, 150.0), ("windows (mlbatch)", 100.0))
         ),
         shown=0,
-        spot=Spot((10.0, 0.0, 0.0), 2.5, 140, 157) if has_clouds else None,
+        spot=Spot((10.0, 0.0, 0.0), 50e6, 140, 157) if has_clouds else None,
         why="" if has_clouds else "No merged clouds: rear without extrinsics.",
     )
 
@@ -149,7 +149,7 @@ def test_the_instant_is_in_words() -> None:
     without = _page(instant=_instant(has_clouds=False))
     assert "No merged clouds: rear without extrinsics." in without
     assert "latest sweeps, rear: 150.0 to 50.0 ms before the instant" in without
-    same = place_words(replace(_instant(), spot=None), 10)
+    same = replace(_instant(), spot=None).place_words(10)
     assert "At no place are the lidars of a fused set farther apart" in same
 
 
