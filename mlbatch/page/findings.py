@@ -17,7 +17,7 @@ _NETWORK = (
     "check network, switch and capture buffers (tcpdump -B, net.core.rmem_max), and the speed of "
     "the disk"
 )
-_POWER = "check the sensor's power, cable and log; the windows are written with complete = false"
+_POWER = "check the sensor's power, cable and log; --drop-incomplete leaves such scans out"
 # Remedy for each warning, by its code (docs/report.md).
 REMEDIES = {
     "cut_off": "copy the file again, or record with tcpdump -U; scans end where the file does",
