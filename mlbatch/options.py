@@ -305,6 +305,34 @@ CONVERT: Final = (
         is_open=True,
     ),
     Option(
+        "accumulate",
+        PATH,
+        "Output",
+        "Also, or without -o only, write one cloud of all scans, placed by the poses of --deskew "
+        "FILE.tum: a .laz, .las, .ply or .pcd file.",
+        metavar="MAP",
+        in_rig=False,
+    ),
+    Option(
+        "voxel",
+        NUMBER,
+        "Output",
+        "Of the map: only the first point in each cube of M m.  [default: all points]",
+        default=0.0,
+        metavar="M",
+        low=0,
+        in_rig=False,
+        shown_default=False,
+    ),
+    Option(
+        "crs",
+        TEXT,
+        "Output",
+        "Of the map: coordinate system of the poses, as EPSG:32633.",
+        metavar="EPSG:N",
+        in_rig=False,
+    ),
+    Option(
         "report",
         PATH,
         "Output",
@@ -454,6 +482,6 @@ BY_NAME: Final = {option.name: option for option in CONVERT}
 # Options that a batch passes on; it has the others itself, or they suit one session only.
 _NOT_PASSED = (
     *("output", "rig", "jobs", "only", "overwrite", "resume", "quiet", "verbose"),
-    *("report", "html", "dry_run", "shard"),
+    *("report", "html", "dry_run", "shard", "accumulate", "voxel", "crs"),
 )
 BATCH: Final = tuple(option for option in CONVERT if option.name not in _NOT_PASSED)

@@ -474,6 +474,8 @@ class Scan:
     # (s,) by sensor, columns present / columns expected, 0 to 1; NaN: unknown.
     fill: F32Array = field(default_factory=lambda: np.zeros(0, np.float32))
     is_partial: bool = False  # the head or the tail
+    # (4, 4) m: pose at the instant that points were moved to by poses; None: they were not.
+    world_from_body: F64Array | None = None
     # If a writer asked for records (`WriterModule`) and the engine packs them: instead of the
     # arrays of points, which are empty then.
     packed: PackedPoints | None = None

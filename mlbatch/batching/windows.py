@@ -10,7 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import NamedTuple
 
-from mlbatch.arrays import F32Array
+from mlbatch.arrays import F32Array, F64Array
 from mlbatch.batching.grid import Grid
 from mlbatch.types import WindowColumns, WindowFigures
 from mlbatch.units import NS_PER_S
@@ -59,6 +59,7 @@ class Window:
     edge_gap_ns: tuple[int, ...]
     fill: F32Array
     is_partial: bool  # the head or the tail
+    world_from_body: F64Array | None = None  # as of `Scan`
 
 
 class Schedule:

@@ -37,7 +37,7 @@ COMMON: Mapping[str, frozenset[str]] = {
         {
             *("recordings", "rig", "metadata", "rate", "deskew"),
             *("only", "start", "end", "min_range", "exclude_box", "output", "format"),
-            *("html", "overwrite", "dry_run", "resume", "fail_on", "quiet"),
+            *("accumulate", "html", "overwrite", "dry_run", "resume", "fail_on", "quiet"),
         }
     ),
     "batch": frozenset(

@@ -30,6 +30,9 @@ from mlbatch.pipeline.output import Output, OutputRequest
 from mlbatch.report.report import RunReport, report_of, report_text
 from mlbatch.writers import discard, report_paths
 
+# Of maps.
+MAP_SUFFIXES = (".laz", ".las", ".ply", ".pcd")
+
 # Loaded where it is needed: a dry run has no files.
 if TYPE_CHECKING:
     from mlbatch.pipeline.files import Files
@@ -53,6 +56,11 @@ class Target(NamedTuple):
     def written(self) -> Path | None:
         """The output, None in a dry run."""
         return self.request.written
+
+    @property
+    def map(self) -> Path | None:
+        """The map, None without and in a dry run."""
+        return None if self.request.dry_run else self.request.accumulate
 
 
 def run(job: Job, target: Target) -> None:
@@ -110,6 +118,9 @@ def _print_summary(
     print_summary(inputs)
     if target.written is not None:
         typer.echo(one_line(f"wrote {target.written}, report {report_path}"))
+    if target.map is not None:
+        report = f", report {report_path}" if target.written is None else ""
+        typer.echo(one_line(f"wrote {target.map}{report}"))
 
 
 def _beyond_limits_before(target: Target, name: str) -> list[str]:
@@ -191,7 +202,7 @@ def _check_page(target: Target, report_path: Path | None, name: str) -> None:
             f"{target.html}: expected a page outside the output, found one in {target.written}; "
             "choose another name"
         )
-    own = [] if report_path is None else [report_path]
+    own = [path for path in (report_path, target.map) if path is not None]
     if target.written is not None:
         own.append(report_paths(target.written, name).scans_csv)
     if page in [path.absolute() for path in own]:
@@ -262,6 +273,8 @@ def _run_segments(job: Job, target: Target) -> list[str]:
             if own_target.written is not None and (is_whole or not target.request.resume):
                 # Outputs of segments have other names.
                 discard(own_target.written)
+            if own_target.map is not None:
+                discard(own_target.map)
             continue
         except NoScanError as err:
             if is_whole:
@@ -290,6 +303,7 @@ def _numbered(target: Target, number: int) -> Target:
     request = target.request._replace(
         output=_with_number(target.request.output, number, ".mcap", ".bag"),
         report=_with_number(target.request.report, number, ".json"),
+        accumulate=_with_number(target.request.accumulate, number, *MAP_SUFFIXES),
     )
     return target._replace(request=request, html=_with_number(target.html, number, ".html"))
 

@@ -52,7 +52,8 @@ def job_of(recordings: Sequence[Path], values: Mapping[str, Any]) -> Job:
 def target_of(values: Mapping[str, Any]) -> Target:
     """Where the result of a conversion goes, from the values of its options."""
     on_jump = choice("--on-jump", values["on_jump"], ("error", "split"))
-    output(values["output"], dry_run=values["dry_run"])
+    if values["accumulate"] is None:
+        output(values["output"], dry_run=values["dry_run"])
     report = values["report"]
     resume(values["resume"], dry_run=values["dry_run"])
     html_scans = shown_scans(values["html_scans"])
@@ -63,7 +64,7 @@ def target_of(values: Mapping[str, Any]) -> Target:
         )
     names = (
         *("output", "format", "point_layout", "compression", "ply_style", "dry_run"),
-        *("overwrite", "resume"),
+        *("overwrite", "resume", "accumulate", "voxel", "crs"),
     )
     request = OutputRequest(
         **{name: values[name] for name in names},

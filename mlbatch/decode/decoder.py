@@ -47,6 +47,7 @@ class ScanHeader:
     is_partial: bool = False
     # Times of points count from the first column of their sensor, not from `start_ns`.
     own_times: bool = False
+    world_from_body: F64Array | None = None
 
 
 class Decoder:
@@ -197,6 +198,7 @@ class Decoder:
             overlap=overlap,
             fill=header.fill,
             is_partial=header.is_partial,
+            world_from_body=header.world_from_body,
             packed=buffer.packed_points(
                 (self._slots, len(columns)) if self._is_organized else (points,),
                 self._engine.totals,

@@ -145,6 +145,7 @@ class DecodePool:
             window.fill,
             window.is_partial,
             own_times=self._own_times,
+            world_from_body=window.world_from_body,
         )
         columns = window.columns
         if not self._split:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -16,6 +17,7 @@ from mlbatch.report.report import RunReport, report_text
 from mlbatch.types import RunInfo
 from mlbatch.writers import (
     FILES_JSONL,
+    REPORT_JSON,
     SHARD_JSON,
     FilesWriter,
     ScanWriter,
@@ -31,6 +33,7 @@ from mlbatch.writers import (
     partial_path,
     record_layout,
     report_paths,
+    side_path,
     state_path,
     sync_entries,
     tidy,
@@ -40,8 +43,11 @@ from mlbatch.writers import (
 # Loaded where it is needed: a dry run has no files.
 if TYPE_CHECKING:
     from mlbatch.pipeline.files import Files
+    from mlbatch.writers.map_writer import MapRequest
 
 Listener = Callable[[str], None]
+# Arrays of scans that LAS stores.
+MAP_EXTRAS = frozenset({"reflectivity"})
 
 
 class OutputRequest(NamedTuple):
@@ -52,6 +58,9 @@ class OutputRequest(NamedTuple):
     point_layout: str = "standard"
     compression: str = "none"
     ply_style: str = "standard"
+    accumulate: Path | None = None  # a map
+    voxel: float = 0.0  # m, of the map; 0: all points
+    crs: str | None = None  # of the map
     dry_run: bool = False
     jobs: int | None = None  # None: auto
     report: Path | None = None  # None: next to the output
@@ -99,14 +108,41 @@ class Output:
         jobs = request.jobs or 1 if path is None else jobs_for(request.jobs, self.format, options)
         self.job = replace(job, extras=extras(self.format, options), jobs=jobs)
         self._options = options
+        self._map = self._map_of(job)
+        if self._map is not None:
+            # Of a map, which takes arrays; also next to scans.
+            scans = frozenset[str]() if path is None else self.job.extras
+            self.job = replace(self.job, extras=scans | MAP_EXTRAS)
         if path is not None:
-            self.job = replace(self.job, record=record_layout(self.format, options))
+            if self._map is None:
+                self.job = replace(self.job, record=record_layout(self.format, options))
             preflight.check_output(self.job, path, self.format)
             if request.resume and self._was_completed(path):
                 self.is_complete = True
                 return
             self._prepare(path, warn)
         preflight.check_report(self.job, self.report_path, path, self.format)
+
+    def _map_of(self, job: Job) -> MapRequest | None:
+        """The map that is to be written, checked; None without, and in a dry run."""
+        request = self._request
+        if request.accumulate is None:
+            for option, is_given in (("--voxel", request.voxel), ("--crs", request.crs)):
+                if is_given:
+                    raise UsageError(
+                        f"{option}: expected --accumulate MAP, found none; leave it out, or write "
+                        "--accumulate map.laz"
+                    )
+            return None
+        from mlbatch.pipeline.accumulate import check_map, map_of
+
+        found = map_of(job, request)
+        if request.dry_run:
+            return None
+        check_map(job, found, request.written)
+        if request.written is None and self.report_path is None:
+            self.report_path = side_path(found.path, REPORT_JSON)
+        return found
 
     def _prepare(self, path: Path, warn: Listener) -> None:
         """Take the files of an interrupted run, or check that all can be made from the start."""
@@ -134,16 +170,20 @@ class Output:
 
     def make(self, progress: Progress | None = None) -> tuple[Conversion, RunReport]:
         """Convert, write the output and its report; returns the run and what the report has."""
-        path = self._request.written
-        if path is None:
+        path, accumulated = self._request.written, self._map
+        if path is None and accumulated is None:
             run, report = convert(self.job, None, progress)
             report = self._completed(report)
             if self.report_path is not None:
                 write_text(self.report_path, report_text(report))
             return run, report
-        run, report = convert(
-            self.job, lambda info: self._open(path, info), progress, self.files, self._finish
-        )
+        open_scans = None if path is None else partial(self._open, path)
+        open_map = None
+        if accumulated is not None:
+            from mlbatch.writers.map_writer import MapWriter
+
+            open_map = partial(MapWriter, accumulated)
+        run, report = convert(self.job, open_scans, progress, self.files, self._finish, open_map)
         return run, self._completed(report)
 
     def _completed(self, report: RunReport) -> RunReport:
@@ -168,22 +208,23 @@ class Output:
             raise not_in_files(self.format)
         return writer
 
-    def _finish(self, report: RunReport, partial: Path) -> None:
+    def _finish(self, report: RunReport, unfinished: Path) -> None:
         """Write the report, or the account of a shard.
 
         Before the output has its name, so that no output is without one.
         """
-        files, output, path = self.files, self._request.written, self.report_path
+        files, path = self.files, self.report_path
+        output = self._request.written or self._request.accumulate
         report = self._completed(report)
         if files is not None and files.is_shard:
             from mlbatch.pipeline.shards import write_account
 
-            write_account(partial, self.format, self._options, files, report)
+            write_account(unfinished, self.format, self._options, files, report)
             return
         if path is None or output is None:
             return
         if path.parent.absolute() == output.absolute():
-            path = partial / path.name
+            path = unfinished / path.name
         write_text(path, report_text(report), self._options.fsync)
         if self._options.fsync and path.parent.absolute() != output.parent.absolute():
             sync_entries(path.parent)

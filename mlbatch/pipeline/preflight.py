@@ -32,8 +32,8 @@ def _real(path: Path) -> Path:
     return Path(os.path.realpath(path))
 
 
-def check_output(job: Job, output: Path, name: str) -> None:
-    """Raise ExportError if the output would overwrite an input; name: of its format."""
+def check_output(job: Job, output: Path, name: str | None) -> None:
+    """Raise ExportError if the output overwrites an input; name: of its format; None: a map."""
     check_name(output)
     target = _real(output)
     for path in job.recordings:
@@ -48,7 +48,8 @@ def check_output(job: Job, output: Path, name: str) -> None:
                 f"{output}: expected an output outside the recordings, found one inside {path}; "
                 "choose another folder"
             )
-    own = [_real(file) for file in _own_files(output, name)]
+    files = [output, partial_path(output)] if name is None else _own_files(output, name)
+    own = [_real(file) for file in files]
     for path in _read_by(job):
         if _real(path) in own or target in _real(path).parents:
             raise ExportError(
@@ -72,7 +73,9 @@ def _own_files(output: Path, name: str) -> list[Path]:
 
 def _read_by(job: Job) -> list[Path]:
     """All files that a job names as input."""
-    return [*job.recordings, *job.selection.metadata, *filter(None, [job.selection.rig])]
+    trajectory = Path(job.deskew)
+    poses = [trajectory] if job.deskew and trajectory.is_file() else []
+    return [*job.recordings, *job.selection.metadata, *filter(None, [job.selection.rig]), *poses]
 
 
 def check_disk(job: Job, output: Path) -> str:

@@ -23,7 +23,7 @@ class ScanTask:
         run: Conversion,
         task: DecodeTask | None,
         before: Sequence[ImuSamples | Message],
-        writer: ScanWriter | None,
+        writers: Sequence[ScanWriter],
         idle: list[DecodeWorker],
         files: Files | None,
         *,
@@ -32,14 +32,14 @@ class ScanTask:
     ) -> None:
         """task: None where messages are to be written without a scan; before: what to write first.
 
-        writer: None in a dry run; idle: decode workers not in use;
+        writers: none in a dry run; idle: decode workers not in use;
         files: of the output, None in a dry run; kept: the scan, if it is in a file of another
         run; index: of its window, None where no scan follows the messages.
         """
         self._run = run
         self._task = task
         self._before = before
-        self._writer = writer
+        self._writers = writers
         self._idle = idle
         self._files = files
         self._kept = kept
@@ -48,7 +48,7 @@ class ScanTask:
         self._decoded: Decoded | None = None
         self._decode_s = 0.0
         self._write_s = 0.0
-        self._job = ScanJob()
+        self._jobs: Sequence[ScanJob] = ()
 
     def decode_with(self, worker: DecodeWorker) -> None:
         """Decode in this thread, so that only writing is left for others."""
@@ -64,34 +64,34 @@ class ScanTask:
         if self._decoded is None and self._task is not None:
             self._worker = self._idle.pop()
             self.decode_with(self._worker)
-        if self._writer is not None:
-            self._job = self._writer_job(self._writer)
-            self._timed(self._job.pack)
+        self._jobs = [self._writer_job(writer) for writer in self._writers]
+        self._timed(lambda job: job.pack())
 
     def append(self) -> None:
         """Count the scan, write what precedes it, reserve its place in the output. In order."""
         if self._decoded is not None:
             scan = self._decoded.scan
-            checksum = self._job.checksum if self._kept is None else self._kept.checksum
+            checksum = self._checksum if self._kept is None else self._kept.checksum
             is_listed = self._files is None or self._files.is_listed(scan)
             self._run.account(scan, checksum, is_listed)
         if self._index is not None:
-            self._job.start(self._index)
+            for job in self._jobs:
+                job.start(self._index)
         for item in self._before:
-            forward(item, self._writer)
-        self._timed(self._job.append)
+            forward(item, self._writers)
+        self._timed(lambda job: job.append())
 
     def compress(self) -> None:
         """Compress what is complete. Any thread."""
-        self._timed(self._job.compress)
+        self._timed(lambda job: job.compress())
 
     def commit(self) -> None:
         """Write what is complete; note the scan for its file. In order."""
         if self._task is not None and self._decoded is not None and self._files is not None:
             scan, outcomes = self._decoded
             if self._kept is None:
-                self._files.note(scan, self._task.only, outcomes, self._job.checksum)
-        self._timed(self._job.commit)
+                self._files.note(scan, self._task.only, outcomes, self._checksum)
+        self._timed(lambda job: job.commit())
         self._run.stages.write_s += self._write_s
         self._run.stages.decode_s += self._decode_s
         if self._worker is not None:
@@ -105,19 +105,22 @@ class ScanTask:
             return writer.skip(self._decoded.scan, self._task.only)
         return writer.write(self._decoded.scan, self._task.only)
 
-    def _timed(self, stage: Callable[[], None]) -> None:
-        if self._writer is None:
-            return
+    @property
+    def _checksum(self) -> int | None:
+        """That of the scan in the output, which comes first."""
+        return self._jobs[0].checksum if self._jobs else None
+
+    def _timed(self, stage: Callable[[ScanJob], None]) -> None:
         began_s = time.perf_counter()
-        stage()
+        for job in self._jobs:
+            stage(job)
         self._write_s += time.perf_counter() - began_s
 
 
-def forward(item: ImuSamples | Message, writer: ScanWriter | None) -> None:
-    """Write IMU samples or a message, if there is a writer."""
-    if writer is None:
-        return
-    if isinstance(item, Message):
-        writer.write_message(item)
-    else:
-        writer.write_imu(item)
+def forward(item: ImuSamples | Message, writers: Sequence[ScanWriter]) -> None:
+    """Write IMU samples or a message."""
+    for writer in writers:
+        if isinstance(item, Message):
+            writer.write_message(item)
+        else:
+            writer.write_imu(item)

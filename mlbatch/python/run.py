@@ -89,7 +89,7 @@ class Report:
 
 @dataclass(frozen=True, slots=True)
 class Run:
-    """A finished conversion; path: of its output, None after a dry run."""
+    """A finished conversion; path: of its output, or of a map alone; None after a dry run."""
 
     path: Path | None
     report: Report
@@ -100,6 +100,7 @@ def run_job(job: Job, path: Path | None, options: OutputOptions) -> Run:
     """Convert to `path` (None: a dry run); the report is written as by the command."""
     jobs = parse_jobs("jobs", str(options.get("jobs", "auto")))
     report = path_of("report", options.get("report"))
+    accumulate = path_of("accumulate", options.get("accumulate"))
     job = replace(
         job,
         passed=names_of(options.get("copy_topics", ())),
@@ -112,9 +113,12 @@ def run_job(job: Job, path: Path | None, options: OutputOptions) -> Run:
         options.get("point_layout", "standard"),
         options.get("compression", "none"),
         options.get("ply_style", "standard"),
-        dry_run=path is None,
+        dry_run=path is None and accumulate is None,
         jobs=jobs,
         report=report,
+        accumulate=accumulate,
+        voxel=options.get("voxel", 0.0),
+        crs=options.get("crs"),
         overwrite=options.get("overwrite", False),
         fsync=options.get("fsync", True),
     )
@@ -124,4 +128,4 @@ def run_job(job: Job, path: Path | None, options: OutputOptions) -> Run:
 
     output = Output(job, request, warn, warn)
     _, content = output.make()
-    return Run(path, Report(content), output.report_path)
+    return Run(path or accumulate, Report(content), output.report_path)

@@ -22,9 +22,11 @@ from mlbatch.report.ledger import (
     SensorLedger,
     check_capture,
     check_datagrams,
+    check_map,
     check_messages,
     ordered,
 )
+from mlbatch.report.map_figures import MapFigures
 from mlbatch.report.motion import MotionLedger
 from mlbatch.report.poses import PoseFigures
 from mlbatch.report.scan_table import ScanStatistics
@@ -37,8 +39,8 @@ Section: TypeAlias = dict[str, Json]
 SCHEMA = "mlbatch.report/1"
 
 
-# Fields that differ from machine to machine.
-_OF_MACHINE = ("timing", "command", "identity")
+# Fields that differ from machine to machine, or are of a file apart from the output.
+_OF_MACHINE = ("timing", "command", "identity", "map")
 # The warning that a recording ends early.
 CUT_OFF = "cut_off"
 # Warnings that are no error with `--strict`: one is for information, one states what the user asked
@@ -155,6 +157,7 @@ class RunReport(NamedTuple):
     variants: tuple[tuple[str, str], ...] = ()  # as `RunInfo.variants`
     deskew: MotionLedger | None = None  # with --deskew
     poses: PoseFigures | None = None  # None: of an earlier version
+    map: MapFigures | None = None  # with --accumulate
     command: str = ""  # command line; "" for runs by the Python interface
     identity: dict[str, str] | None = None  # of the job, see `identity_of_parts`
     version: str = mlbatch.__version__
@@ -255,6 +258,7 @@ def build_report(run: RunReport) -> Section:
         **({"faults": [item._asdict() for item in run.faults]} if run.faults else {}),
         **({"deskew": dict(run.deskew.as_json())} if run.deskew is not None else {}),
         **({} if run.poses is None else {"poses": _section(to_json(run.poses))}),
+        **({} if run.map is None else {"map": _section(to_json(run.map))}),
         "scans": _scans(run.scans),
         "timing": {} if run.timing is None else _timing(run.timing),
         "warnings": [item._asdict() for item in run.warnings],
@@ -297,6 +301,8 @@ def imbalances(run: RunReport) -> list[str]:
     lines += check_datagrams(run.capture.datagrams + run.repeated, ledgers, unassigned)
     for sensor in run.sensors:
         lines += [f"{sensor.name}: {line}" for line in sensor.ledger.check()]
+    if run.map is not None:
+        lines += check_map(run.scans.points, run.map.points, run.map.thinned)
     for one in run.messages:
         lines += check_messages(one.topic, one.read, one.written, one.dropped)
     return lines
@@ -336,6 +342,8 @@ def summary_lines(run: RunReport) -> list[str]:
         )
     if run.deskew is not None:
         lines.append(run.deskew.describe())
+    if run.map is not None:
+        lines.append(run.map.describe())
     if run.first_scan:
         lines.append(f"first scan at {run.first_scan}")
     for name, count in scans.underfilled_by_sensor.items():

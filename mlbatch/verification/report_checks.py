@@ -43,7 +43,7 @@ _OUTCOMES = ("no_return", "range", "box", "repeated", "written")
 _UNDERFILLED = 0.5
 _UNWRITTEN = ("empty", "dropped_incomplete")
 # Sections that differ between runs on the same recording.
-_MACHINE = ("timing", "inputs", "command", "identity")
+_MACHINE = ("timing", "inputs", "command", "identity", "map")
 
 Json: TypeAlias = "dict[str, Json] | list[Json] | str | int | float | bool | None"
 Keys: TypeAlias = "tuple[str | int, ...]"
@@ -273,6 +273,9 @@ def check_ledgers(report: Document) -> None:
         _check_clipped(report, path)
     if report.at("deskew") is not None:
         _check_motion(report)
+    if report.at("map") is not None:
+        thinned = {"thinned": report.number("map", "thinned") or 0}
+        _check_sum(report, ("scans", "points"), ("map", "points"), thinned)
     for i in range(report.length("messages")):
         path = ("messages", i)
         _check_sum(report, (*path, "read"), (*path, "written"), report.counts(*path, "dropped"))

@@ -87,6 +87,7 @@ __all__ = [
     "prepare",
     "record_layout",
     "report_paths",
+    "side_path",
     "state_path",
     "sync_entries",
     "tidy",

@@ -1,4 +1,4 @@
-"""Scans as LAS 1.4 files, and as LAZ, compressed by lazrs.
+"""Scans as LAS 1.4 files, and as LAZ, compressed by lazrs (LASzip).
 
 Sources: ASPRS, "LAS specification 1.4 R15", tables 3, 4, 16 and 24; docs/sources/outputs.md
 section 6.
@@ -9,23 +9,26 @@ from __future__ import annotations
 import importlib
 import io
 import struct
+from collections.abc import Sequence
 from datetime import datetime, timezone
+from pathlib import Path
 from types import ModuleType
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import mlbatch
 from mlbatch.clocks.timescale import GPS_EPOCH_S, TAI, TAI_GPS_S, UTC, gps_utc_s
 from mlbatch.errors import ExportError, UsageError, install_extra
-from mlbatch.types import RecordLayout, RecordPiece
+from mlbatch.types import RecordLayout, RecordPiece, RunInfo
 from mlbatch.units import NS_PER_S
+from mlbatch.writers.base import ScanWriter, WriterOptions
 from mlbatch.writers.point_layouts import ScanRecords, record_bytes
 from mlbatch.writers.scan_comments import scan_comments
+from mlbatch.writers.scan_folder import FolderWriter, check_dense
 
 if TYPE_CHECKING:
     from mlbatch.types import PackedPoints, Scan
     from mlbatch.writers.output_file import Bytes
 
-LAS_EXTRAS = frozenset({"reflectivity"})
 # Coordinates are int32 multiples of it: 0.05 mm of error, up to 214 km from the origin.
 SCALE_M = 1e-4
 _FARTHEST_M = (2**31 - 1) * SCALE_M
@@ -40,6 +43,8 @@ _STANDARD_TIME = 1
 # Required of this point format, also without a coordinate system.
 _WKT = 16
 _POINT_FORMAT = 6
+# Of a record, before the extra bytes.
+BASE_BYTES = 30
 _COMPRESSED = 128
 # Table 4: reserved, user, number, bytes after it, description.
 _VLR = struct.Struct("<H16sHH32s")
@@ -77,13 +82,35 @@ _PLAIN = RecordLayout(41, (RecordPiece("las", 0, 0, 41),), epoch_s=gps_shift_s)
 RECORD = RecordLayout(43, (RecordPiece("las", 0, 0, 43),), _PLAIN, gps_shift_s)
 
 
-def load_lazrs() -> ModuleType:
-    """Return the compressor; UsageError without it."""
+def extras(options: WriterOptions) -> frozenset[str]:
+    """Return what extra bytes store."""
+    return frozenset({"reflectivity"})
+
+
+def record_layout(options: WriterOptions) -> RecordLayout | None:
+    """Return the records of all points."""
+    return RECORD
+
+
+def open_folder(
+    name: str,
+    target: Path,
+    info: RunInfo,
+    options: WriterOptions,
+    lazrs: ModuleType | None = None,
+) -> ScanWriter:
+    """Start a folder of LAS files, or of LAZ files by `lazrs`; name: of the format."""
+    check_dense(name, info)
+    return FolderWriter(target, info, options, name, lambda: LasEncoder(lazrs))
+
+
+def load_lazrs(option: str) -> ModuleType:
+    """Return the compressor; UsageError without it; option: what needs it."""
     try:
         return importlib.import_module("lazrs")
     except ImportError as err:
         raise UsageError(
-            f"--format laz: expected the package lazrs, found none ({err}); {install_extra('las')}"
+            f"{option}: expected the package lazrs, found none ({err}); {install_extra('las')}"
         ) from err
 
 
@@ -101,15 +128,15 @@ class LasEncoder:
         point_bytes = (RECORD if scan.reflectivity is not None else _PLAIN).step
         text = "\n".join(scan_comments(scan, "x y z m; gps_time s; time_ns ns after start_ns"))
         vlrs = [
-            _vlr("LASF_Spec", 4, "Extra Bytes Record", _extra_bytes(records, point_bytes)),
-            _vlr(VLR_USER, VLR_NUMBER, "scan", text.encode()),
+            vlr("LASF_Spec", 4, "Extra Bytes Record", _extra_bytes(records, point_bytes)),
+            vlr(VLR_USER, VLR_NUMBER, "scan", text.encode()),
         ]
+        head = _head(scan, packed, point_bytes)
         if self._lazrs is None:
-            return [_header(scan, packed, vlrs, _POINT_FORMAT, point_bytes), records]
-        items = self._lazrs.LazVlr.new_for_compression(_POINT_FORMAT, point_bytes - 30)
-        vlrs.append(_vlr("laszip encoded", 22204, "http://laszip.org", items.record_data()))
+            return [las_header(head, vlrs), records]
+        items = lazrs_items(self._lazrs, point_bytes)
         stream = io.BytesIO()
-        stream.write(_header(scan, packed, vlrs, _POINT_FORMAT | _COMPRESSED, point_bytes))
+        stream.write(las_header(head, vlrs, items))
         # Threads come from --jobs.
         compressor = self._lazrs.LasZipCompressor(stream, items)
         if len(records):
@@ -118,13 +145,29 @@ class LasEncoder:
         return [stream.getbuffer()]
 
 
-def _header(
-    scan: Scan, packed: PackedPoints, vlrs: list[bytes], point_format: int, point_bytes: int
-) -> bytes:
-    """Return a header and its variable length records."""
+class LasHead(NamedTuple):
+    """What a header says of points.
+
+    start_ns: of the first scan; counts: all points, and the farther of two returns; low_m, high_m:
+    corners, with the offset; point_bytes: of a record.
+    """
+
+    timescale: str
+    start_ns: int
+    counts: tuple[int, int]
+    low_m: Sequence[float]
+    high_m: Sequence[float]
+    point_bytes: int
+    scale_m: float = SCALE_M
+    offset_m: Sequence[float] = (0.0, 0.0, 0.0)
+
+
+def _head(scan: Scan, packed: PackedPoints, point_bytes: int) -> LasHead:
+    """Return what the header of a scan says; ExportError where coordinates do not fit."""
     (count,) = packed.shape
     second = 0
-    bounds = [0.0] * 6
+    low_m: Sequence[float] = (0.0, 0.0, 0.0)
+    high_m = low_m
     if packed.totals is not None and count:
         low_m, high_m, second = packed.totals
         farthest_m = max(map(abs, (*low_m, *high_m)))
@@ -134,24 +177,41 @@ def _header(
                 f"laz, found {farthest_m:.0f} m; write another format, or --max-range"
             )
         # Rounded as the coordinates, half to even.
-        ends = (end_m for ends_m in zip(high_m, low_m, strict=True) for end_m in ends_m)
-        bounds = [round(end_m / SCALE_M) * SCALE_M for end_m in ends]
-    is_standard = scan.info.timescale in (UTC, TAI)
+        low_m, high_m = ([round(m / SCALE_M) * SCALE_M for m in ends] for ends in (low_m, high_m))
+    timescale = scan.info.timescale
+    return LasHead(timescale, scan.start_ns, (count, second), low_m, high_m, point_bytes)
+
+
+def lazrs_items(lazrs: ModuleType, point_bytes: int) -> Any:
+    """Return the description of compressed points of so many bytes; lazrs has no types."""
+    return lazrs.LazVlr.new_for_compression(_POINT_FORMAT, point_bytes - BASE_BYTES)
+
+
+def las_header(head: LasHead, vlrs: Sequence[bytes], items: Any = None) -> bytes:
+    """Return a header and its variable length records; items: of compressed points."""
+    point_format = _POINT_FORMAT
+    if items is not None:
+        laszip = vlr("laszip encoded", 22204, "http://laszip.org", items.record_data())
+        vlrs = [*vlrs, laszip]
+        point_format |= _COMPRESSED
+    is_standard = head.timescale in (UTC, TAI)
     # Equal runs give equal bytes: the day of the scan, not of the run.
-    day = datetime.fromtimestamp(scan.start_ns // NS_PER_S, timezone.utc).timetuple()
+    day = datetime.fromtimestamp(head.start_ns // NS_PER_S, timezone.utc).timetuple()
+    count, second = head.counts
+    bounds = (end_m for ends_m in zip(head.high_m, head.low_m, strict=True) for end_m in ends_m)
     fields = [
         *(b"LASF", 0, _WKT | (_STANDARD_TIME if is_standard else 0), b"", 1, 4),
         *(b"mlbatch", f"mlbatch {mlbatch.__version__}".encode()),
         *(day.tm_yday, day.tm_year),
         *(_HEADER.size, _HEADER.size + sum(map(len, vlrs)), len(vlrs)),
-        *(point_format, point_bytes, *[0] * 6),
-        *(SCALE_M, SCALE_M, SCALE_M, 0.0, 0.0, 0.0, *bounds),
+        *(point_format, head.point_bytes, *[0] * 6),
+        *(*[head.scale_m] * 3, *head.offset_m, *bounds),
         *(0, 0, 0, count, count - second, second, *[0] * 13),
     ]
     return b"".join([_HEADER.pack(*fields), *vlrs])
 
 
-def _vlr(user: str, number: int, description: str, content: bytes) -> bytes:
+def vlr(user: str, number: int, description: str, content: bytes) -> bytes:
     """Return a variable length record."""
     head = _VLR.pack(0, user.encode(), number, len(content), description.encode())
     return head + content
@@ -172,3 +232,10 @@ def _extra_bytes(records: memoryview, point_bytes: int) -> bytes:
         ends = (struct.pack(form, low), struct.pack(form, high))
         parts.append(_EXTRA.pack(kind, _HAS_EXTREMES, name.encode(), *ends, description.encode()))
     return b"".join(parts)
+
+
+def described(names: Sequence[str]) -> bytes:
+    """Return the descriptions of some of the extra bytes, without lowest and highest."""
+    known = {name: (kind, text) for name, kind, text, _ in _EXTRA_BYTES}
+    rows = ((known[name][0], name.encode(), known[name][1].encode()) for name in names)
+    return b"".join(_EXTRA.pack(kind, 0, name, b"", b"", text) for kind, name, text in rows)

@@ -1,35 +1,20 @@
-"""A folder of LAZ files: LAS, compressed by lazrs; needs the extra `las`.
-
-Source: ASPRS, "LAS specification 1.4 R15" (point data record format 6, extra bytes), and
-docs/sources/outputs.md section 6. Compression: LASzip.
-"""
+"""A folder of LAZ files: LAS, compressed by lazrs; needs the extra `las`."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
-from mlbatch.types import RecordLayout, RunInfo
+from mlbatch.types import RunInfo
 from mlbatch.writers.base import ScanWriter, WriterOptions
-from mlbatch.writers.las_encoder import LAS_EXTRAS, RECORD, LasEncoder, load_lazrs
-from mlbatch.writers.scan_folder import FolderWriter, check_dense
+from mlbatch.writers.las_encoder import extras, load_lazrs, open_folder, record_layout
+
+__all__ = ["COMPRESSES", "FORMAT", "SUFFIX", "extras", "open_writer", "record_layout"]
 
 FORMAT = "laz"
 SUFFIX: str | None = None
 COMPRESSES = False
 
 
-def extras(options: WriterOptions) -> frozenset[str]:
-    """Return what extra bytes store."""
-    return LAS_EXTRAS
-
-
-def record_layout(options: WriterOptions) -> RecordLayout | None:
-    """Return the records of all points."""
-    return RECORD
-
-
 def open_writer(target: Path, info: RunInfo, options: WriterOptions) -> ScanWriter:
     """Start a folder of LAZ files."""
-    check_dense(FORMAT, info)
-    lazrs = load_lazrs()
-    return FolderWriter(target, info, options, FORMAT, lambda: LasEncoder(lazrs))
+    return open_folder(FORMAT, target, info, options, load_lazrs("--format laz"))
