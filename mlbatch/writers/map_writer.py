@@ -9,7 +9,7 @@ import contextlib
 import io
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -29,9 +29,6 @@ from mlbatch.writers.map_files import (
     map_format,
 )
 from mlbatch.writers.voxel_filter import MOST_VOXELS, VoxelFilter
-
-if TYPE_CHECKING:
-    from _typeshed import ReadableBuffer
 
 # The offset is the first pose, rounded to so many m: 0 in local frames.
 _OFFSET_STEP_M = 1000.0
@@ -216,7 +213,7 @@ class _Disk(io.FileIO):
     def __init__(self, path: Path) -> None:
         super().__init__(path, "r+")
 
-    def write(self, data: ReadableBuffer, /) -> int:
+    def write(self, data: Any, /) -> int:
         """Write bytes."""
         try:
             return super().write(data)

@@ -26,7 +26,7 @@ OPTIONS: dict[str, set[str]] = {
             decode only include-sensor ignore exclude-sensor fault fault-seed html dry-run
             html-scans report shard jobs compression strict no-pose-check fail-on overwrite
             resume no-fsync quiet
-            verbose
+            verbose accumulate voxel crs
         """,
         "merge": "output fail-on overwrite no-fsync quiet",
         "batch": """
@@ -61,6 +61,7 @@ OPTIONS: dict[str, set[str]] = {
 # Options of `convert` that a batch passes on; the others are its own, or have no meaning there.
 _OWN = ("--output", "--rig", "--jobs", "--overwrite", "--resume", "--quiet", "--verbose")
 _PASSED = OPTIONS["convert"] - {*_OWN, "--report", "--html", "--dry-run", "--shard"}
+_PASSED -= {"--accumulate", "--voxel", "--crs"}
 # There `--only` names sessions.
 _PASSED -= {"--only", "--include-sensor"}
 OPTIONS["batch"] |= _PASSED

@@ -88,7 +88,14 @@ OUTPUT = {
     "fsync": False,
     "report": "report.json",
     "jobs": 2,
+    "accumulate": "map.ply",
+    "voxel": 0.5,
+    "crs": "EPSG:32632",
 }
+# At rest in Munich: one pose per 0.4 s around the recording.
+POSES = "\n".join(
+    f"{1_777_881_599 + 0.4 * step:.1f} 691000 5335000 520 0 0 0 1" for step in range(20)
+)
 # What an option needs beside it.
 WITH: dict[str, dict[str, Any]] = {
     "align_to": {"align_clocks": True},
@@ -127,6 +134,11 @@ def test_every_option_of_the_page_works(name: str, tmp_path: Path) -> None:
         options = {name: "ouster_122647000123", "identity_extrinsics": True}
     if name == "report":
         options["report"] = tmp_path / "report.json"
+    if name in ("accumulate", "voxel", "crs"):
+        (tmp_path / "poses.tum").write_text(POSES)
+        options |= {"accumulate": tmp_path / "map.ply", "deskew": tmp_path / "poses.tum"}
+    if name == "crs":
+        pytest.importorskip("pyproj")
     run = mlbatch.convert(capture, None, **options)
     assert run.report.scans.written > 0
     if name in OUTPUT:

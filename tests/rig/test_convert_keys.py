@@ -29,6 +29,7 @@ NOT_IN_A_RIG = {
     ),
     "--shard",
     *("--rate", "--metadata", "--exclude-box"),
+    *("--accumulate", "--voxel", "--crs"),
 }
 ALIASES = {"--include-sensor", "--exclude-sensor", "--copy-topic"}
 

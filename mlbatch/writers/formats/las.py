@@ -1,4 +1,7 @@
-"""A folder of LAS files."""
+"""A folder of LAS files.
+
+Source: as of `las_encoder.py`, docs/sources/outputs.md section 6.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""A folder of LAZ files: LAS, compressed by lazrs; needs the extra `las`."""
+"""A folder of LAZ files: LAS, compressed by lazrs; needs the extra `las`.
+
+Source: as of `las_encoder.py`, docs/sources/outputs.md section 6.
+"""
 
 from __future__ import annotations
 
