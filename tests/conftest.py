@@ -41,6 +41,7 @@ LONG = (
     "cli/test_fusion.py",
     "cli/test_progress.py",
     "cli/test_shards.py",
+    "pipeline/test_accumulate.py",
     "pipeline/test_extract.py",
     "clocks/test_align.py::test_memory",
     "clocks/test_simulated.py",
