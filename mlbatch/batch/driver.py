@@ -3,12 +3,19 @@
 from __future__ import annotations
 
 import contextlib
+import logging
+import os
+import platform
+import shlex
+import sys
 import threading
 from collections import deque
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
+from datetime import datetime, timezone
 from functools import partial
+from pathlib import Path
 from queue import SimpleQueue
 from typing import Any, Protocol
 
@@ -22,9 +29,11 @@ from mlbatch.errors import (
     MlbatchError,
     UsageError,
     install_extra,
+    one_line,
     system_error,
 )
 
+BATCH_LOG = "batch.log"
 # Requests to a store at the same time.
 _REQUESTS = 16
 _CONNECT_S = 10
@@ -55,6 +64,7 @@ class Batch:
     workers: int = 1
     fail_fast: bool = False
     retry_failed: bool = False
+    log: Path | None = None  # gets a line for each session that begins or ends
     scheduler: str = ""  # address of a Dask scheduler; "": threads of this process
     progress: Progress = field(default=lambda status: None)
 
@@ -72,24 +82,41 @@ class Batch:
                 continue
             found[task.session.name] = SessionStatus(task.session.name, record, is_earlier=True)
             self.progress(found[task.session.name])
+        names = [task.session.name for task in tasks]
+        if not left:
+            return [found[name] for name in names]
+        command = shlex.join(["mlbatch", *sys.argv[1:]])
+        self._note(f"{len(tasks)} sessions, {len(left)} to run: {command}")
         try:
             self._run(left, found)
         except KeyboardInterrupt as err:
+            self._note("interrupted")
             raise Interrupted(
                 f"interrupted; {len(found)} of {len(tasks)} sessions have ended; "
                 "the same command continues with the others"
             ) from err
         except DiskFullError as err:
+            self._note(f"ended: {err}")
             raise DiskFullError(
                 f"{err} ({len(found)} of {len(tasks)} sessions have ended)"
             ) from err
-        names = [task.session.name for task in tasks]
+        self._note("ended")
         return [found[name] for name in names if name in found]
+
+    def _note(self, line: str) -> None:
+        """Add a line to the log, in one write, since several drivers may share it."""
+        if self.log is None:
+            return
+        now = datetime.now(timezone.utc).strftime("%Y-%m-%dT%H:%M:%SZ")
+        text = one_line(f"{now} {platform.node()}:{os.getpid()} {line}")
+        # A session whose files have no space says so itself.
+        with contextlib.suppress(OSError):
+            self.log.parent.mkdir(parents=True, exist_ok=True)
+            with self.log.open("ab", buffering=0) as file:
+                file.write(f"{text}\n".encode(errors="surrogateescape"))
 
     def _run(self, waiting: deque[Task], found: dict[str, SessionStatus]) -> None:
         """Run sessions. A simple queue, since an interrupt may leave a lock of Python's taken."""
-        if not waiting:
-            return
         executor: Executor = Threads(self.workers)
         if self.scheduler:
             # All at once, so that workers that join later get some; else one per thread.
@@ -100,6 +127,7 @@ class Batch:
             while waiting or running:
                 if waiting and running < executor.at_once:
                     running += 1
+                    self._note(f"session {waiting[0].session.name}: begun")
                     executor.begin(waiting.popleft(), outcomes.put)
                     continue
                 outcome = outcomes.get()
@@ -107,6 +135,7 @@ class Batch:
                 if isinstance(outcome, DiskFullError):
                     raise outcome
                 found[outcome.name] = outcome
+                self._note(f"session {outcome.name}: {outcome.line}")
                 if self.fail_fast and outcome.is_failed:
                     waiting.clear()
                 self.progress(outcome)
@@ -201,6 +230,8 @@ class Dask:
                 f"--scheduler {address}: expected a Dask scheduler, found none ({err}); start one "
                 "with `dask scheduler`, or leave out --scheduler"
             ) from err
+        # A worker that died is no news: its sessions go to others, or fail with a line.
+        logging.getLogger("distributed.client").setLevel(logging.ERROR)
         self.at_once = at_once or max(1, sum(self._client.nthreads().values()))
         # The scheduler forgets a task that nobody refers to.
         self._futures: list[Any] = []

@@ -2,21 +2,37 @@
 
 from __future__ import annotations
 
+import contextlib
 import glob as globbing
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from datetime import date
+from fnmatch import fnmatchcase
+from functools import partial
 from pathlib import Path, PurePosixPath
 
 from mlbatch import options
-from mlbatch.batch.session import Option, Session, check_name, check_unique, is_url, read_rig
+from mlbatch.batch.session import (
+    NO_LIMITS,
+    Limits,
+    Option,
+    Session,
+    check_name,
+    check_unique,
+    is_url,
+    read_limits,
+    read_rig,
+)
 from mlbatch.errors import RecordingError, UsageError
 from mlbatch.readers.datasets import BAG_METADATA
 from mlbatch.rig.yaml_tree import Node, read_yaml
 
 SCHEMA = "mlbatch.batch/1"
-_KEYS = ("schema", "rig", "options", "sessions")
-_SESSION_KEYS = ("glob", "name", "inputs", "rig", "options")
+_KEYS = ("schema", "rig", "rigs", "options", "limits", "known_bad", "sessions")
+_SESSION_KEYS = ("glob", "name", "inputs", "rig", "options", "limits")
+_RULE_KEYS = ("sessions", "from", "until", "rig")
+_LIMIT_KEYS = ("time", "disk")
 _TEXT = re.compile(r"\S(.*\S)?")
 _FIELDS = re.compile(r"\{(\w*)\}")
 _TEMPLATE_WORDS = ("folder", "stem", "name")
@@ -27,6 +43,7 @@ _SUFFIXES = re.compile(r"(?<=.)(\.(gz|zstd?|pcapng|pcap|cap|mcap|bag|db3))+$")
 _DOCUMENTS = re.compile(r".*\.(json|ya?ml|csv|dat|tum|txt|md|log|html)", re.IGNORECASE)
 # Names that a message shows.
 _SHOWN = 5
+_DATE = re.compile(r"(?<!\d)(20\d\d)([-_]?)(\d\d)\2(\d\d)")
 _WILD = re.compile(r"[*?\[]")
 # Options of `convert` that a manifest may have: of the batch, `--only` names sessions.
 _OPTIONS = {one.name: one for one in options.BATCH} | {
@@ -39,26 +56,73 @@ class Common:
     """Values for all sessions that have none of their own.
 
     rig: may have fields as names of sessions; rig_place: key of the manifest, "" of the command
-    line, which reads it itself.
+    line, which reads it itself; rules: rigs by name or date, the first that fits before `rig`.
     """
 
     rig: str | None = None
     options: tuple[Option, ...] = ()
     rig_place: str = ""
+    limits: Limits = NO_LIMITS
+    rules: tuple[RigRule, ...] = ()
 
-    def rig_of(self, match: str) -> str | None:
-        """The rig of a session, by what its pattern matched or by its first recording."""
-        return None if self.rig is None else _named(self.rig, match)
+    def rig_of(self, name: str, match: str) -> str | None:
+        """The rig of a session, by what its pattern matched or by its first recording.
+
+        Raises UsageError where the manifest has no such file.
+        """
+        rule = next((one for one in self.rules if one.fits(name, match)), None)
+        rig, place = (self.rig, self.rig_place) if rule is None else (rule.rig, rule.place)
+        if rig is None and self.rules:
+            raise UsageError(
+                f"{self.rules[0].place}: expected a rig for session {name}, found no rule that "
+                "fits it; add one, or the key rig for all others"
+            )
+        if rig is None:
+            return None
+        rig = _named(rig, match)
+        if place and not is_url(rig) and not Path(rig).is_file():
+            raise UsageError(
+                f"{place}: expected the rig of session {name}, found no file {rig}; "
+                "correct the path, which is relative to the manifest"
+            )
+        return rig
 
     def session(self, name: str, inputs: tuple[str, ...], match: str) -> Session:
         """A session; UsageError where it has no rig."""
-        rig = self.rig_of(match)
-        if rig and self.rig_place and not is_url(rig) and not Path(rig).is_file():
+        return Session(name, inputs, self.rig_of(name, match), self.options, self.limits)
+
+
+@dataclass(frozen=True, slots=True)
+class RigRule:
+    """A rig for sessions by name (a pattern), or by date: from the first day to the last."""
+
+    rig: str
+    place: str
+    pattern: str = "*"
+    first: date | None = None
+    last: date | None = None
+
+    def fits(self, name: str, match: str) -> bool:
+        """Whether it is for a session; UsageError where one needs a date and has none."""
+        if not fnmatchcase(name, self.pattern):
+            return False
+        if self.first is None and self.last is None:
+            return True
+        day = _date_in(name) or _date_in(match)
+        if day is None:
             raise UsageError(
-                f"{self.rig_place}: expected the rig of session {name}, found no file {rig}; "
-                "correct the path, which is relative to the manifest"
+                f"{self.place}: expected a date in the name of session {name} or in its path, "
+                "found none; choose its rig by the key sessions in a rule before this one"
             )
-        return Session(name, inputs, rig, self.options)
+        return (self.first or day) <= day <= (self.last or day)
+
+
+def _date_in(text: str) -> date | None:
+    """The last date in a name or path: 2024-05-01, 2024_05_01 or 20240501."""
+    for found in reversed(list(_DATE.finditer(text))):
+        with contextlib.suppress(ValueError):
+            return date(int(found[1]), int(found[3]), int(found[4]))
+    return None
 
 
 def _nothing(text: str) -> None: ...
@@ -105,16 +169,18 @@ def _of_pattern(
             f"{where}: expected recordings or folders, found none for {pattern!r}; check the "
             "pattern"
         )
-    found = [(match, _inputs(match, common.rig_of(match))) for match in matches]
-    if not any(inputs for _, inputs in found):
+    found = []
+    for match in matches:
+        name = _named(template, match)
+        found.append((name, match, _inputs(match, partial(common.rig_of, name, match))))
+    if not any(inputs for *_, inputs in found):
         raise UsageError(
             f"{where}: expected recordings in what matches {pattern!r}, found none; check the "
             "pattern, or give the rig that describes folders of sweeps"
         )
-    for match, inputs in found:
+    for name, match, inputs in found:
         if inputs:
-            name = check_name(_named(template, match), where)
-            yield common.session(name, inputs, match)
+            yield common.session(check_name(name, where), inputs, match)
 
 
 def _matches(pattern: str) -> list[str]:
@@ -147,7 +213,7 @@ def _may_be_recording(match: str) -> bool:
     return any(one.recognises(head) for one in readers())
 
 
-def _inputs(match: str, rig_name: str | None) -> tuple[str, ...]:
+def _inputs(match: str, rig_of: Callable[[], str | None]) -> tuple[str, ...]:
     """Recordings of a match: itself, or the recordings in a folder; empty if there are none."""
     if is_url(match):
         if not match.endswith("/"):
@@ -164,7 +230,11 @@ def _inputs(match: str, rig_name: str | None) -> tuple[str, ...]:
         if (_RECORDINGS.fullmatch(entry.name) and entry.is_file())
         or (entry / BAG_METADATA).is_file()
     )
-    rig = None if found else read_rig(rig_name)
+    rig = None
+    if not found:
+        # A folder without recordings and without a rig is no session.
+        with contextlib.suppress(UsageError):
+            rig = read_rig(rig_of())
     sweeps = () if rig is None else [one.sweeps.glob for one in rig.sensors if one.sweeps]
     is_of_sweeps = any(next(path.glob(pattern), None) is not None for pattern in sweeps)
     return (match,) if is_of_sweeps else found
@@ -191,15 +261,66 @@ def _of_manifest(path: Path, given: Common, say: Callable[[str], None]) -> Itera
     nodes = root["sessions"].elements("sessions")
     if not nodes:
         raise root["sessions"].error("a list of sessions", "an empty one", "add one")
+    rules = tuple(map(_rule, root["rigs"].elements("rules"))) if "rigs" in root else ()
+    found: list[Session] = []
     for node in nodes:
         entries = node.fields(_SESSION_KEYS)
         own = _options(entries.get("options"))
         common = replace(given, options=_joined(of_all, own, mine))
         rig = entries.get("rig", root.get("rig"))
+        if given.rig is None:
+            common = replace(common, rules=() if "rig" in entries else rules)
         if given.rig is None and rig is not None:
-            _check_fields(_text(rig), rig)
-            common = replace(common, rig=_path(rig), rig_place=rig.place)
-        yield from _of_entry(node, entries, common, say)
+            common = replace(common, rig=_rig_path(rig), rig_place=rig.place)
+        for limits in filter(None, (root.get("limits"), entries.get("limits"))):
+            common = replace(common, limits=_limits(limits, common.limits, given.limits))
+        found += _of_entry(node, entries, common, say)
+    yield from _with_known_bad(found, root.get("known_bad"))
+
+
+def _rule(node: Node) -> RigRule:
+    entries = node.fields(_RULE_KEYS, ("rig",))
+    if len(entries) == 1:
+        raise node.error("sessions, from or until", "only rig", "add one, or use the key rig")
+    pattern = _text(entries["sessions"]) if "sessions" in entries else "*"
+    first, last = (_day(entries[key]) if key in entries else None for key in ("from", "until"))
+    if first and last and first > last:
+        raise node.error(f"until not before {first}", str(last), "exchange them")
+    return RigRule(_rig_path(entries["rig"]), entries["rig"].place, pattern, first, last)
+
+
+def _day(node: Node) -> date:
+    text = _text(node)
+    try:
+        return date.fromisoformat(text)
+    except ValueError:
+        raise node.error("a date as 2024-05-31", repr(text), "correct it") from None
+
+
+def _limits(node: Node, known: Limits, given: Limits) -> Limits:
+    """Limits of a manifest: over those known before, below those of the command line."""
+    entries = node.fields(_LIMIT_KEYS)
+    time, disk = (_text(entries[key]) if key in entries else None for key in _LIMIT_KEYS)
+    found = read_limits(time, disk, node.place)
+    return Limits(
+        given.time_s or found.time_s or known.time_s,
+        given.disk_bytes or found.disk_bytes or known.disk_bytes,
+    )
+
+
+def _with_known_bad(sessions: Sequence[Session], node: Node | None) -> Iterator[Session]:
+    """The sessions; those that a list of names or patterns has with its reason."""
+    entries: Mapping[str, Node] = {}
+    if node is not None:
+        if node.kind != "mapping":
+            raise node.error("sessions with reasons", node.shown, "write `NAME: reason`")
+        entries = node.entries
+    for pattern, reason in entries.items():
+        if not any(fnmatchcase(one.name, pattern) for one in sessions):
+            raise reason.error("the name of a session", repr(pattern), "correct it")
+    for one in sessions:
+        fitting = (_text(reason) for key, reason in entries.items() if fnmatchcase(one.name, key))
+        yield replace(one, known_bad=next(fitting, ""))
 
 
 def _of_entry(
@@ -219,6 +340,12 @@ def _of_entry(
     template = "{stem}" if name is None else _text(name)
     _check_fields(template, name or node)
     yield from _of_pattern(_path(entries["glob"]), template, common, entries["glob"].place, say)
+
+
+def _rig_path(node: Node) -> str:
+    """A path of a rig, with fields of names."""
+    _check_fields(_text(node), node)
+    return _path(node)
 
 
 def _check_fields(template: str, node: Node) -> None:

@@ -14,6 +14,7 @@ from mlbatch.writers import write_text
 SCHEMA = "mlbatch.session/1"
 DONE = "done"
 FAILED = "failed"
+KNOWN_BAD = "known_bad"
 
 
 @dataclass(slots=True)
@@ -21,10 +22,11 @@ class SessionRecord:
     """Outcome of a session; counts are from its reports."""
 
     name: str
-    state: str  # done or failed
+    state: str  # done, failed or known_bad
     exit_code: int  # of convert; negative: the signal that ended it
-    line: str  # the error, or the limits that were exceeded; "" if done
+    line: str  # the error, the limits that were exceeded, or why it is bad; "" if done
     key: dict[str, str]
+    limit: str = ""  # of time or disk that ended it; another one makes it run again
     attempts: int = 1
     inputs: list[str] = field(default_factory=list)
     outputs: list[str] = field(default_factory=list)
@@ -60,15 +62,16 @@ def read_record(place: Path | str) -> SessionRecord | None:
         record = SessionRecord(**{key: value for key, value in found.items() if key in known})
     except TypeError:
         return None
-    is_valid = isinstance(record.key, dict) and record.state in (DONE, FAILED)
+    is_valid = isinstance(record.key, dict) and record.state in (DONE, FAILED, KNOWN_BAD)
     return record if is_valid else None
 
 
 def write_record(folder: Path, record: SessionRecord) -> None:
-    """Write session.json, and remove the note that a run has begun."""
+    """Write session.json, and remove the note that a run has begun, unless it can go on."""
     document = {"schema": SCHEMA, **asdict(record)}
     write_text(folder / SESSION_JSON, json.dumps(document, indent=1, ensure_ascii=False) + "\n")
-    (folder / STARTED_JSON).unlink(missing_ok=True)
+    if not record.limit:
+        (folder / STARTED_JSON).unlink(missing_ok=True)
 
 
 def read_started(folder: Path) -> dict[str, str]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -28,6 +28,7 @@ OWN = re.compile(
     r"|(report|page)(\.seg\d+)?\.(json|html)(\.partial)?|log\.txt"
     r"|(session|started)\.json(\.partial)?"
 )
+_AMOUNT = re.compile(r"(\d{1,9}(?:\.\d{1,6})?) ?([A-Za-z]+)")
 _NAME = re.compile(r"[^\s/.\\\x00-\x1f\x7f][^/\\\x00-\x1f\x7f]{0,199}")
 # Options that cannot change an output.
 _NOT_IN_KEY = frozenset({"--jobs", "--no-fsync"})
@@ -49,13 +50,36 @@ class Option:
 
 
 @dataclass(frozen=True, slots=True)
+class Limits:
+    """What a session may take; None: no limit. disk_bytes: of its folder, unfinished files too."""
+
+    time_s: float | None = None
+    disk_bytes: float | None = None
+
+    @property
+    def texts(self) -> tuple[str, ...]:
+        """Each limit in words."""
+        time = f"{self.time_s:g} s" if self.time_s is not None else ""
+        disk = f"{self.disk_bytes / 1e6:g} MB" if self.disk_bytes is not None else ""
+        return tuple(filter(None, (time, disk)))
+
+
+NO_LIMITS = Limits()
+
+
+@dataclass(frozen=True, slots=True)
 class Session:
-    """Recordings that are converted together; inputs and rig: paths or URLs."""
+    """Recordings that are converted together; inputs and rig: paths or URLs.
+
+    known_bad: why it is not converted, "" if it is.
+    """
 
     name: str
     inputs: tuple[str, ...]
     rig: str | None = None
     options: tuple[Option, ...] = ()
+    limits: Limits = NO_LIMITS
+    known_bad: str = ""
 
     def absolute(self) -> Session:
         """The session with absolute paths, for processes with other working folders."""
@@ -86,6 +110,25 @@ class Session:
             (one for one in self.options if one.name not in _NOT_IN_KEY), key=lambda one: one.name
         )
         return [word for one in kept for word in one.words]
+
+
+_TIME_UNITS = {"s": 1.0, "min": 60.0, "h": 3600.0}
+_DISK_UNITS = {"MB": 1e6, "GB": 1e9, "TB": 1e12}
+
+
+def read_limits(time: str | None, disk: str | None, where: str) -> Limits:
+    """Limits as written: `90 min` and `50 GB`; UsageError with the place otherwise."""
+    return Limits(
+        None if time is None else _amount(time, _TIME_UNITS, "2 h, 90 min or 30 s", where),
+        None if disk is None else _amount(disk, _DISK_UNITS, "50 GB, 500 MB or 1.5 TB", where),
+    )
+
+
+def _amount(text: str, units: Mapping[str, float], examples: str, where: str) -> float:
+    match = _AMOUNT.fullmatch(text.strip())
+    if match is None or match[2] not in units or not float(match[1]):
+        raise UsageError(f"{where}: expected a limit as {examples}, found {text!r}; add its unit")
+    return float(match[1]) * units[match[2]]
 
 
 def check_name(name: str, where: str) -> str:

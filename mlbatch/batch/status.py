@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from fnmatch import fnmatch
 from pathlib import Path
 
-from mlbatch.batch.record import DONE, FAILED, SessionRecord, read_record
+from mlbatch.batch.record import DONE, FAILED, KNOWN_BAD, SessionRecord, read_record
 from mlbatch.batch.session import LOG_TXT, SESSION_JSON, STARTED_JSON, is_url
 from mlbatch.errors import RecordingError
 from mlbatch.report.report import CUT_OFF
@@ -18,7 +18,7 @@ CLOCK_CODES = frozenset(
 )
 UNFINISHED = "unfinished"
 SKIPPED = "skipped"
-STATES = (DONE, FAILED, UNFINISHED)
+STATES = (DONE, FAILED, UNFINISHED, KNOWN_BAD)
 HEAD = ("session", "state", "scans", "lost", "fill", "clocks", "output", "time", "")
 
 
@@ -37,13 +37,13 @@ class SessionStatus:
 
     @property
     def state(self) -> str:
-        """done, failed or unfinished: running, or interrupted."""
+        """done, failed, known_bad or unfinished: running, or interrupted."""
         return UNFINISHED if self.record is None else self.record.state
 
     @property
     def word(self) -> str:
         """State in the last table of a batch; failures of earlier runs, too, are failures."""
-        return SKIPPED if self.is_earlier and not self.is_failed else self.state
+        return SKIPPED if self.is_earlier and self.state == DONE else self.state
 
     @property
     def is_failed(self) -> bool:
@@ -59,6 +59,13 @@ class SessionStatus:
     def reason(self) -> str:
         """Why it failed; of a session that is done, the codes of its warnings."""
         return "" if self.record is None else self.record.line or ", ".join(self.record.warnings)
+
+    @property
+    def line(self) -> str:
+        """The row in words, for a log."""
+        named = zip(HEAD[2:], self.row[2:], strict=True)
+        cells = (f"{name} {cell}".strip() for name, cell in named if cell)
+        return ", ".join((self.word, *cells))
 
     @property
     def clock_codes(self) -> list[str]:

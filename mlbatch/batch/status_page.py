@@ -6,10 +6,11 @@ import os
 from pathlib import Path
 from urllib.parse import quote
 
-from mlbatch.batch.record import DONE, FAILED
+from mlbatch.batch.record import DONE, FAILED, KNOWN_BAD
 from mlbatch.batch.session import is_url
 from mlbatch.batch.status import (
     HEAD,
+    STATES,
     UNFINISHED,
     BatchStatus,
     SessionStatus,
@@ -21,7 +22,7 @@ from mlbatch.page import check_page, write_text_page
 from mlbatch.page.templates import Verdict, render
 
 # In the order of the page, with the level of each.
-_LEVELS = {FAILED: "problem", UNFINISHED: "warning", DONE: "good"}
+_LEVELS = {FAILED: "problem", UNFINISHED: "warning", KNOWN_BAD: "neutral", DONE: "good"}
 _ORDER = [*_LEVELS]
 # Levels of loss and fill, as in docs/page.md.
 _LOSS_WARNING = 0.001
@@ -55,12 +56,14 @@ def write_status_page(path: Path, status: BatchStatus) -> None:
 def _verdict(status: BatchStatus) -> Verdict:
     count = len(status.sessions)
     failed, unfinished = status.count(FAILED), status.count(UNFINISHED)
+    known_bad = status.count(KNOWN_BAD)
     cut_off = sum(one.is_cut_off for one in status.sessions)
     level = "problem" if failed else "warning" if unfinished or cut_off else "good"
     heading = f"{status.count(DONE)} of {count} sessions are done"
     if failed:
         heading = f"{failed} of {count} sessions failed"
     parts = [f"{unfinished} unfinished: running, or interrupted."] * bool(unfinished)
+    parts += [f"{known_bad} known as bad, not converted."] * bool(known_bad)
     parts += [f"{cut_off} with a recording that was cut off."] * bool(cut_off)
     return Verdict(level, level, heading, " ".join(parts))
 
@@ -68,7 +71,7 @@ def _verdict(status: BatchStatus) -> Verdict:
 def _cards(status: BatchStatus) -> dict[str, str]:
     records = status.records
     return {
-        **{state: f"{status.count(state):,}" for state in (DONE, FAILED, UNFINISHED)},
+        **{state: f"{status.count(state):,}" for state in STATES},
         "cut off": f"{sum(one.is_cut_off for one in status.sessions):,}",
         "scans": f"{sum(one.scans for one in records):,}",
         "lost packets": loss_text(records),

@@ -24,6 +24,7 @@ from mlbatch.batch.identity import CONTENT, Key, content, is_same, session_key
 from mlbatch.batch.record import (
     DONE,
     FAILED,
+    KNOWN_BAD,
     SessionRecord,
     read_record,
     read_started,
@@ -63,6 +64,9 @@ _LOCK_S = 20.0
 _FULL = (os.strerror(errno.ENOSPC), os.strerror(errno.EDQUOT))
 _LEAST_FREE_BYTES = 1 << 20
 _POLL_S = 0.05
+# The folder of a session is measured this often, and a process that should end has this long.
+_DISK_POLL_S = 2.0
+_GRACE_S = 60.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -122,7 +126,12 @@ def tasks_of(
 def finished(task: Task) -> SessionRecord | None:
     """The record of a session whose inputs, options and versions did not change since."""
     record = read_record(task.upload or task.folder)
-    if record is None:
+    bad = task.session.known_bad
+    if record is None or (record.state == KNOWN_BAD) != bool(bad):
+        return None
+    if bad:
+        return record if record.line == bad else None
+    if record.limit and record.limit not in task.session.limits.texts:
         return None
     if not task.upload and any(not (task.folder / name).exists() for name in record.outputs):
         return None
@@ -174,6 +183,8 @@ def _run_session(task: Task, stop: threading.Event) -> SessionRecord:
     session = task.session
     began_s = time.monotonic()
     _check(stop)
+    if session.known_bad:
+        return _known_bad(task, stop)
     try:
         key = session_key(session, task.cwd)
     except MlbatchError as err:
@@ -188,9 +199,10 @@ def _run_session(task: Task, stop: threading.Event) -> SessionRecord:
             return done
         _prepare(task, key)
         with _staged(task) as local:
-            code, attempts = _attempts(local, log, stop)
-            _add_page(local, code, log, stop)
-        line = "" if code == 0 else _line(task.folder, code)
+            code, attempts, limit = _attempts(local, log, stop)
+            if not limit:
+                _add_page(local, code, log, stop)
+        line = "" if code == 0 else _limit_line(limit) if limit else _line(task.folder, code)
         if code not in (0, _LIMIT) and _is_full(task.folder, line):
             raise _disk_full(task.folder)
         record = SessionRecord(
@@ -199,6 +211,7 @@ def _run_session(task: Task, stop: threading.Event) -> SessionRecord:
             code,
             line,
             key | {CONTENT: content(session)},
+            limit=limit,
             attempts=attempts,
             inputs=[*session.inputs],
             wall_s=round(time.monotonic() - began_s, 3),
@@ -206,6 +219,16 @@ def _run_session(task: Task, stop: threading.Event) -> SessionRecord:
         _add_figures(record, task.folder)
         _publish(task, record)
         return record
+
+
+def _known_bad(task: Task, stop: threading.Event) -> SessionRecord:
+    """Note why a session is not converted; what an earlier run made of it is removed."""
+    session = task.session
+    with _locked(task.folder, stop):
+        _prepare(task, {})
+        record = SessionRecord(session.name, KNOWN_BAD, 0, session.known_bad, {})
+        _publish(task, record)
+    return record
 
 
 @contextlib.contextmanager
@@ -233,7 +256,11 @@ def _publish(task: Task, record: SessionRecord) -> None:
     record_url = f"{task.upload}/{SESSION_JSON}"
     # While files are replaced, nothing may say that they are complete.
     remote.remove(record_url)
-    mine = [path for path in own_files(task.folder) if path.name != STARTED_JSON]
+    mine = [
+        path
+        for path in own_files(task.folder)
+        if path.name != STARTED_JSON and path.suffix != ".partial"
+    ]
     files = {
         f"{task.upload}/{path.relative_to(task.folder).as_posix()}": path
         for top in mine
@@ -287,9 +314,11 @@ def _prepare(task: Task, key: Key) -> None:
                 f"{folder}: expected the folder of a session, found {path.name} in it; choose "
                 "another output or name"
             )
-    if not is_same(read_started(folder), key, task.session):
-        # session.json first: what is deleted must not look complete.
-        (folder / SESSION_JSON).unlink(missing_ok=True)
+    # session.json first: what is deleted, or goes on, must not look complete.
+    (folder / SESSION_JSON).unlink(missing_ok=True)
+    if task.session.known_bad:
+        _clear(folder, kept=(LOG_TXT,))
+    elif not is_same(read_started(folder), key, task.session):
         _clear(folder, kept=(LOG_TXT, STARTED_JSON))
         write_started(folder, key | {CONTENT: content(task.session)})
 
@@ -305,19 +334,69 @@ def _clear(folder: Path, kept: Sequence[str]) -> None:
             path.unlink(missing_ok=True)
 
 
-def _attempts(task: Task, log: BinaryIO, stop: threading.Event) -> tuple[int, int]:
-    """Run the process until it ends; exit code and number of attempts."""
+def _attempts(task: Task, log: BinaryIO, stop: threading.Event) -> tuple[int, int, str]:
+    """Run the process until it ends; exit code, number of attempts, the limit that ended it."""
     attempts = 0
+    watch = _Watch(task)
     while True:
         attempts += 1
         log.truncate(0)
-        code = _run(words_of(task), task, log, stop)
+        code = _run(words_of(task), task, log, stop, watch)
         _check(stop)
+        # A process that was told to end may have been at its end.
+        if watch.limit and code not in _FINAL:
+            if watch.is_full:
+                _clear(task.folder, kept=(LOG_TXT, STARTED_JSON))
+            return code, attempts, watch.limit
         if code in _FINAL or attempts > task.retries:
-            return code, attempts
+            return code, attempts, ""
 
 
-def _run(words: list[str], task: Task, log: BinaryIO, stop: threading.Event) -> int:
+class _Watch:
+    """Whether a session is beyond its limits of time or disk."""
+
+    def __init__(self, task: Task) -> None:
+        self._folder = task.folder
+        self._limits = task.session.limits
+        self._began_s = self._measured_s = time.monotonic()
+        self.limit = ""
+        self.is_full = False
+
+    def is_beyond(self) -> bool:
+        """Look at the clock, and now and then at the folder."""
+        time_s, disk_bytes = self._limits.time_s, self._limits.disk_bytes
+        now_s = time.monotonic()
+        if time_s is not None and now_s - self._began_s > time_s:
+            (self.limit, *_) = self._limits.texts
+        elif disk_bytes is not None and now_s - self._measured_s > _DISK_POLL_S:
+            self._measured_s = now_s
+            self.is_full = _size(self._folder) > disk_bytes
+            if self.is_full:
+                (*_, self.limit) = self._limits.texts
+        return bool(self.limit)
+
+
+def _size(folder: Path) -> int:
+    """Bytes of all files in a folder; files may vanish meanwhile."""
+    total = 0
+    for path in folder.rglob("*"):
+        with contextlib.suppress(OSError):
+            total += path.lstat().st_size
+    return total
+
+
+def _limit_line(limit: str) -> str:
+    what = "time" if limit.endswith(" s") else "disk"
+    return f"beyond its limit of {what}, {limit}; with another limit the same command runs it again"
+
+
+def _run(
+    words: list[str],
+    task: Task,
+    log: BinaryIO,
+    stop: threading.Event,
+    watch: _Watch | None = None,
+) -> int:
     process = subprocess.Popen(
         [sys.executable, "-m", "mlbatch.cli.child", *words],
         stdin=subprocess.PIPE,
@@ -328,6 +407,12 @@ def _run(words: list[str], task: Task, log: BinaryIO, stop: threading.Event) -> 
     )
     with process:
         while process.poll() is None and not stop.is_set():
+            if watch is not None and watch.is_beyond():
+                process.terminate()
+                with contextlib.suppress(subprocess.TimeoutExpired):
+                    return process.wait(_GRACE_S)
+                process.kill()
+                break
             with contextlib.suppress(subprocess.TimeoutExpired):
                 process.wait(_POLL_S)
         if stop.is_set():

@@ -56,8 +56,20 @@ def batch(
     only: Annotated[
         list[str] | None, typer.Option(help="This session; repeatable.", metavar="NAME")
     ] = None,
+    time_limit: Annotated[
+        str | None,
+        typer.Option(help="Longest time of a session: 2 h, 90 min. [default: manifest's]"),
+    ] = None,
+    disk_limit: Annotated[
+        str | None,
+        typer.Option(help="Most disk of a session: 50 GB. [default: manifest's]"),
+    ] = None,
     plan: Annotated[
-        bool, typer.Option("--plan", help="Print sessions, bytes and hours; convert nothing.")
+        bool,
+        typer.Option("--plan", help="Print sessions, bytes and hours; keep nothing on disk."),
+    ] = False,
+    names: Annotated[
+        bool, typer.Option("--list", help="Print the names of the sessions, a line each.")
     ] = False,
     fail_fast: Annotated[
         bool, typer.Option("--fail-fast", help="After the first failure begin no other session.")
@@ -81,11 +93,12 @@ def batch(
     **values: Any,
 ) -> None:
     """Convert many sessions, a process each; a second run does what is missing or changed."""
-    from mlbatch.batch.driver import Batch
+    from mlbatch.batch.driver import BATCH_LOG, Batch
     from mlbatch.batch.manifest import Common, chosen, parse_part, sessions_of
     from mlbatch.batch.plan import plan_of
+    from mlbatch.batch.record import KNOWN_BAD
     from mlbatch.batch.remote import default_cache
-    from mlbatch.batch.session import is_url
+    from mlbatch.batch.session import is_url, read_limits
     from mlbatch.batch.task import tasks_of
     from mlbatch.cli import EXIT_LIMIT
     from mlbatch.cli.summary import say
@@ -97,11 +110,16 @@ def batch(
         say("--cache-gb is ignored, since copies are removed when their session has ended")
     jobs = _jobs(jobs, workers)
     numbers = parse_part(part)
-    given = Common(rig, tuple(_given(context, values, jobs)))
+    limits = read_limits(time_limit, disk_limit, "--time-limit, --disk-limit")
+    given = Common(rig, tuple(_given(context, values, jobs)), limits=limits)
     if rig is not None and not is_url(rig):
         # A mistake in it would fail every session.
         read_rig(Path(rig))
     sessions = chosen(sessions_of(sources, given, say), only or (), numbers)
+    if names:
+        for session in sessions:
+            typer.echo(session.name)
+        return
     with interruptible():
         tasks = tasks_of(
             *(sessions, output, (cache or default_cache()).absolute()),
@@ -116,11 +134,12 @@ def batch(
                 workers=workers,
                 fail_fast=fail_fast,
                 retry_failed=retry_failed,
+                log=None if is_url(output) else Path(output) / BATCH_LOG,
                 scheduler=scheduler,
                 progress=progress,
             ).run(tasks)
     if not quiet:
-        print_status(found, ("done", "skipped", "failed"), len(tasks))
+        print_status(found, ("done", "skipped", "failed", KNOWN_BAD), len(tasks))
     if any(one.is_failed for one in found):
         raise typer.Exit(EXIT_LIMIT)
 
@@ -194,13 +213,14 @@ def _progress(count: int, *, quiet: bool) -> Iterator[Progress]:
 
 def print_status(sessions: Sequence[SessionStatus], words: Sequence[str], count: int) -> None:
     """Print a table of sessions, and how many are in each state; count: with those not begun."""
+    from mlbatch.batch.record import KNOWN_BAD
     from mlbatch.batch.status import HEAD
     from mlbatch.cli.tables import table_lines
 
     for line in table_lines([HEAD, *(one.row for one in sessions)]) if sessions else ():
         typer.echo(line)
     found = [one.word for one in sessions]
-    counts = [f"{found.count(word)} {word}" for word in words]
+    counts = [f"{found.count(word)} {word}" for word in words if word != KNOWN_BAD or word in found]
     if len(sessions) < count:
         counts.append(f"{count - len(sessions)} not begun (--fail-fast)")
     typer.echo(f"{count} sessions: {', '.join(counts)}")
@@ -216,11 +236,8 @@ def _print_plan(plan: Plan) -> None:
         rows.append((one.name, one.word, str(one.inputs), size, one.problem))
     for line in table_lines(rows):
         typer.echo(line)
-    source = (
-        f"from {plan.measured} finished sessions" if plan.measured else "usual values, not measured"
-    )
     typer.echo(
         f"{len(plan.to_run)} of {len(plan.sessions)} sessions to convert: "
         f"{bytes_text(plan.bytes_in)} in, about {bytes_text(plan.bytes_out)} out, "
-        f"about {duration_text(plan.seconds)} with {plan.workers} worker(s) ({source})"
+        f"about {duration_text(plan.seconds)} with {plan.workers} worker(s) ({plan.source})"
     )

@@ -16,7 +16,8 @@ from tests.builders.sessions import NS_PER_MS, SMALL, Unit, write_session
 
 # Imported by every Python process that has it on its path: the process of a session `crash*` ends
 # by SIGSEGV at once; that of a session `killed*` by SIGKILL at its first attempt, when it writes;
-# that of a session `full*` at its first attempt by the line of a full disk.
+# that of a session `full*` at its first attempt by the line of a full disk. Those of `slow*` and
+# `big*` never end at their first attempt; `big*` has written 3 MB.
 SABOTEUR = """
 import os, signal, sys, threading, time
 words = getattr(sys, "orig_argv", [])
@@ -32,6 +33,12 @@ if "mlbatch.cli.child" in words:
         line = f"{target}: expected to write it, found {reason!r}; free space on this disk"
         os.write(2, f"mlbatch: error: {line}\\n".encode())
         os._exit(1)
+    if name.startswith(("slow", "big")) and not os.path.exists(marker):
+        open(marker, "w").close()
+        if name.startswith("big"):
+            with open(target + ".partial", "wb") as file:
+                file.write(bytes(3_000_000))
+        time.sleep(3600)
     if name.startswith("killed") and not os.path.exists(marker):
         open(marker, "w").close()
         def kill():
@@ -69,15 +76,20 @@ class Dataset:
 
 
 def write_dataset(
-    folder: Path, names: Iterable[str], options: Mapping[str, Options] | None = None
+    folder: Path,
+    names: Iterable[str],
+    options: Mapping[str, Options] | None = None,
+    more: str = "",
 ) -> Dataset:
-    """Sessions of one lidar, each with its own ranges; options: of `convert`, by session.
+    """Sessions of one lidar, each with its own ranges.
+
+    options: of `convert`, by session; more: lines of the manifest.
 
     `hopeless*` is no recording, that of `cut*` ends early, and `segments*` is longer.
     """
     for name in ("raw", "saboteur", "marks"):
         (folder / name).mkdir(parents=True)
-    lines = ["schema: mlbatch.batch/1", "options: {rate: 20}", "sessions:"]
+    lines = ["schema: mlbatch.batch/1", "options: {rate: 20}", more, "sessions:"]
     for number, name in enumerate(names):
         own = json.dumps((options or {}).get(name, {}))
         lines.append(f'  - {{glob: "raw/{name}/", name: "{{folder}}", options: {own}}}')

@@ -259,7 +259,8 @@ def test_a_plan_writes_nothing(good: Dataset, tmp_path: Path) -> None:
     assert (ended.code, ended.err) == (0, "")
     assert ended.table == dict.fromkeys(GOOD, "missing")
     assert ended.last.startswith("4 of 4 sessions to convert: ")
-    assert "usual values" in ended.last
+    assert ended.last.endswith("(from the first 10 s of session b1)")
+    assert run(good, out, "--list").out.split() == GOOD
     first, second = (run(good, out, "--plan", "--part", f"{number}/2").table for number in (1, 2))
     assert not set(first) & set(second)
     assert set(first) | set(second) == set(GOOD)
@@ -268,7 +269,7 @@ def test_a_plan_writes_nothing(good: Dataset, tmp_path: Path) -> None:
 
 def _plan(sizes: list[int], workers: int, cores: int = 16) -> Plan:
     sessions = tuple(PlannedSession(str(n), "missing", 1, size) for n, size in enumerate(sizes))
-    return Plan(sessions, USUAL_RATIO, USUAL_BYTES_PER_S, USUAL_START_S, 0, workers, cores)
+    return Plan(sessions, USUAL_RATIO, USUAL_BYTES_PER_S, USUAL_START_S, "", workers, cores)
 
 
 @pytest.mark.parametrize(
@@ -296,7 +297,7 @@ def test_a_plan_of_finished_sessions_is_their_time(good: Dataset, tmp_path: Path
     sessions = sessions_of([str(good.manifest)], Common())
     tasks = tasks_of(sessions, str(out), tmp_path, retries=0, pages=True)
     plan = plan_of(tasks, 1)
-    assert plan.measured == 4
+    assert plan.source == "from 4 finished sessions"
     again = replace(plan, sessions=tuple(replace(one, word="missing") for one in plan.sessions))
     wall_s = sum(record["wall_s"] for record in records)
     assert again.seconds == pytest.approx(wall_s, rel=0.05)

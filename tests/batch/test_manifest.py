@@ -59,6 +59,16 @@ sessions:
 - {inputs: [b.pcap], rig: sweeps.yaml, options: {on_jump: split, rate: 29.97}}
 - {inputs: [c.pcap], options: {split: false, on-jump: error, format: mcap}}
 """
+DATED = """rig: old.yaml
+rigs:
+- {sessions: "*-wet", rig: wet.yaml}
+- {from: 2024-05-01, until: 2024-06-30, rig: may.yaml}
+- {from: 2024-07-01, rig: new.yaml}
+sessions:
+- {glob: "raw/*/", name: "{folder}"}
+- {name: own, inputs: [raw/20240501/a.pcap], rig: own.yaml}
+- {name: by-path, inputs: [raw/20240501/a.pcap]}
+"""
 # Files, a manifest, and its sessions.
 CASES = {
     # d2 is a bag; notes has no recording.
@@ -97,6 +107,21 @@ CASES = {
             "d1": "raw/d1/a.pcap -r raw/d1/rig.yaml -> scans.mcap",
             "d2": "raw/d2/b.pcap -r raw/d2/rig.yaml -> scans.mcap",
             "b7": "raw/d2/b.pcap -r raw/d2/rig.yaml -> scans.mcap",
+        },
+    ),
+    # The rig of all is for dates before the first rule; a pattern precedes dates.
+    "rigs by name and date": (
+        "old.yaml wet.yaml may.yaml new.yaml own.yaml raw/2024-04-30/a.pcap raw/20240501/a.pcap "
+        "raw/2024_06_30_x/a.pcap raw/20240701-dry/a.pcap raw/20240701-wet/a.pcap",
+        DATED,
+        {
+            "2024-04-30": "raw/2024-04-30/a.pcap -r old.yaml -> scans.mcap",
+            "20240501": "raw/20240501/a.pcap -r may.yaml -> scans.mcap",
+            "2024_06_30_x": "raw/2024_06_30_x/a.pcap -r may.yaml -> scans.mcap",
+            "20240701-dry": "raw/20240701-dry/a.pcap -r new.yaml -> scans.mcap",
+            "20240701-wet": "raw/20240701-wet/a.pcap -r wet.yaml -> scans.mcap",
+            "own": "raw/20240501/a.pcap -r own.yaml -> scans.mcap",
+            "by-path": "raw/20240501/a.pcap -r may.yaml -> scans.mcap",
         },
     ),
     "folders of sweeps, by the rig": (
@@ -153,6 +178,7 @@ def test_files_that_are_no_recordings_are_left_out_with_a_line(tmp_path: Path) -
     assert lines[1].endswith(f"manifest.yaml:2: sessions[0].glob: {expected}")
 
 
+ONE = "sessions: [{name: b7, inputs: [a.pcap]}]\n"
 NO_RIG = "sessions[0].rig: expected the rig of session b7, found no file DIR/raw/rig.yaml; correct"
 # A manifest after its schema, and a part of the message.
 MISTAKES = {
@@ -174,6 +200,21 @@ MISTAKES = {
     "slash in a name": ("sessions: [{name: a/b, inputs: [x]}]\n", "folder name"),
     "dots": ('sessions: [{name: "..", inputs: [x]}]\n', "folder name"),
     "the same name": ("sessions: [{inputs: [a/x.pcap]}, {inputs: [b/X.pcap]}]\n", "different"),
+    "a rule without a choice": (f"rigs: [{{rig: a.yaml}}]\n{ONE}", "sessions, from or until"),
+    "no day": (f"rigs: [{{from: 2024-02-30, rig: a.yaml}}]\n{ONE}", "a date as 2024-05-31"),
+    "days exchanged": (
+        f"rigs: [{{from: 2024-03-01, until: 2024-02-01, rig: a.yaml}}]\n{ONE}",
+        "exchange them",
+    ),
+    "no date in a name": (
+        f"rigs: [{{from: 2024-03-01, rig: a.yaml}}]\n{ONE}",
+        "name of session b7",
+    ),
+    "no rule fits": (f"rigs: [{{sessions: a*, rig: a.yaml}}]\n{ONE}", "no rule that fits it"),
+    "a limit without a unit": (f"limits: {{time: 30}}\n{ONE}", "2 h, 90 min or 30 s, found '30'"),
+    "a limit of nothing": (f"limits: {{disk: 0 GB}}\n{ONE}", "50 GB"),
+    "bad without a reason": (f"known_bad: [b7]\n{ONE}", "sessions with reasons"),
+    "an unknown bad one": (f"known_bad: {{b8: rain}}\n{ONE}", "name of a session, found 'b8'"),
     "no flag": ("options: {split: maybe}\nsessions: []\n", "true or false"),
 }
 

@@ -72,6 +72,41 @@ class Batch:
     status: str
 
 
+def test_known_bad_sessions_are_no_failures_and_limits_end_sessions(tmp_path: Path) -> None:
+    """The first word of a limit that is raised makes a session run again."""
+    more = 'known_bad: {"hopeless*": rain in the lens, b1: no GNSS}\nlimits: {disk: 1 MB}'
+    data = write_dataset(tmp_path / "data", ["a1", "big", "b1", "hopeless", "slow"], more=more)
+    out = tmp_path / "out"
+    words = ("--only", "big", "--only", "slow", "--time-limit", "4 s", "--retries", "0")
+    first = run(data, out, *words)
+    assert (first.code, first.table) == (3, {"big": "failed", "slow": "failed"})
+    assert "beyond its limit of disk, 1 MB; " in first.out
+    assert "beyond its limit of time, 4 s; " in first.out
+    assert not list(out.glob("big/scans*"))
+    # The same limits: the same failures, and nothing runs.
+    assert run(data, out, *words).table == first.table
+    assert not list((data.folder / "marks").glob("a*"))
+    second = run(data, out, "--time-limit", "2 h", "--disk-limit", "1 TB")
+    bad = dict.fromkeys(("b1", "hopeless"), "known_bad")
+    assert (second.code, second.table) == (0, bad | dict.fromkeys(("a1", "big", "slow"), "done"))
+    assert second.last == "5 sessions: 3 done, 0 skipped, 0 failed, 2 known_bad"
+    assert not list(out.glob("b1/scans*"))
+    page = tmp_path / "status.html"
+    assert command("batch-status", out, "--page", page).code == 0
+    text = page.read_text(encoding="utf-8")
+    assert "3 of 5 sessions are done" in text
+    assert "2 known as bad, not converted." in text
+    assert "rain in the lens" in text
+    log = (out / "batch.log").read_text(encoding="utf-8").splitlines()
+    assert sum(line.endswith("session slow: begun") for line in log) == 2
+    assert any("session slow: failed" in line and "limit of time, 4 s" in line for line in log)
+    # Bad no more: it is converted; one that is bad now loses its output.
+    data.manifest.write_text(data.manifest.read_text(encoding="utf-8").replace("b1:", "a1:"))
+    third = run(data, out, "--time-limit", "2 h", "--disk-limit", "1 TB")
+    assert (third.table["a1"], third.table["b1"]) == ("known_bad", "done")
+    assert not list(out.glob("a1/scans*"))
+
+
 @pytest.fixture(scope="module")
 def data(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
     options = {name: row.options for name, row in ROWS.items()}

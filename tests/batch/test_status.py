@@ -46,7 +46,7 @@ def test_the_table_has_every_session(data: Dataset) -> None:
 
 def test_json_has_every_session(data: Dataset) -> None:
     found = json.loads(command("batch-status", data.folder / "out", "--json").out)
-    assert found["states"] == {"done": 2, "failed": 2, "unfinished": 1}
+    assert found["states"] == {"done": 2, "failed": 2, "unfinished": 1, "known_bad": 0}
     records = {one["name"]: one["record"] for one in found["sessions"]}
     assert records["later"] is None
     assert (records["a1"]["warnings"], records["cut1"]["warnings"]) == ([], ["cut_off"])

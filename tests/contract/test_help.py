@@ -31,7 +31,7 @@ OPTIONS: dict[str, set[str]] = {
         "merge": "output fail-on overwrite no-fsync quiet",
         "batch": """
             output rig workers jobs retries part only plan fail-fast retry-failed no-pages
-            scheduler cache quiet
+            scheduler cache quiet time-limit disk-limit list
         """,
         "batch-status": "json page",
         "inspect": "rig whole verbose metadata json write-rig",
