@@ -67,7 +67,7 @@ def read_record(place: Path | str) -> SessionRecord | None:
 
 
 def write_record(folder: Path, record: SessionRecord) -> None:
-    """Write session.json, and remove the note that a run has begun, unless it can go on."""
+    """Write session.json, and remove the note that a run has begun, unless it can continue."""
     document = {"schema": SCHEMA, **asdict(record)}
     write_text(folder / SESSION_JSON, json.dumps(document, indent=1, ensure_ascii=False) + "\n")
     if not record.limit:

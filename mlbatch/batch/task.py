@@ -314,7 +314,7 @@ def _prepare(task: Task, key: Key) -> None:
                 f"{folder}: expected the folder of a session, found {path.name} in it; choose "
                 "another output or name"
             )
-    # session.json first: what is deleted, or goes on, must not look complete.
+    # session.json first: what is deleted, or continued, must not look complete.
     (folder / SESSION_JSON).unlink(missing_ok=True)
     if task.session.known_bad:
         _clear(folder, kept=(LOG_TXT,))
@@ -343,7 +343,7 @@ def _attempts(task: Task, log: BinaryIO, stop: threading.Event) -> tuple[int, in
         log.truncate(0)
         code = _run(words_of(task), task, log, stop, watch)
         _check(stop)
-        # A process that was told to end may have been at its end.
+        # A process that was told to end may be complete.
         if watch.limit and code not in _FINAL:
             if watch.is_full:
                 _clear(task.folder, kept=(LOG_TXT, STARTED_JSON))
