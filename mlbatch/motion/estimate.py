@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from mlbatch.arrays import F64Array
-from mlbatch.motion.registration import ORIGIN, Cloud, Pose, Registration, register
+from mlbatch.motion.registration import ORIGIN, ColumnCloud, Pose, Registration, register
 from mlbatch.motion.voxels import LocalMap, first_in_voxels
 from mlbatch.units import NS_PER_S
 
@@ -68,9 +68,9 @@ class VelocityEstimator:
         # Middle of the last window that is in the map, or of the first one.
         self._middle_ns: int | None = None
         # The first window, until there is a second one.
-        self._first: Cloud | None = None
+        self._first: ColumnCloud | None = None
 
-    def add(self, cloud: Cloud, middle_ns: int, period_ns: int) -> Estimate:
+    def add(self, cloud: ColumnCloud, middle_ns: int, period_ns: int) -> Estimate:
         """Register the next window; period_ns: its length."""
         near = np.flatnonzero((cloud.points_m**2).sum(axis=1) < _FARTHEST_M**2)
         cloud = cloud.take(near)
@@ -94,12 +94,14 @@ class VelocityEstimator:
         reason = NO_GAIN if found.gain < _LEAST_GAIN else ""
         return Estimate(found.velocity, reason, found.residual_m)
 
-    def _begin(self, cloud: Cloud, middle_ns: int, reason: str) -> Estimate:
+    def _begin(self, cloud: ColumnCloud, middle_ns: int, reason: str) -> Estimate:
         self._first = cloud
         self._middle_ns = middle_ns
         return Estimate(reason=reason)
 
-    def _second(self, first: Cloud, cloud: Cloud, middle_ns: int, gap_s: float) -> Estimate:
+    def _second(
+        self, first: ColumnCloud, cloud: ColumnCloud, middle_ns: int, gap_s: float
+    ) -> Estimate:
         """Register the second window against the first one, which has its velocity.
 
         The velocity of none of them is known before: it is repeated until it settles.
@@ -125,7 +127,7 @@ class VelocityEstimator:
         shift, turn = math.hypot(*change[:3]), math.hypot(*change[3:])
         return JUMP if shift > _MOST_ACCELERATION or turn > _MOST_TURN_ACCELERATION else ""
 
-    def _keep(self, cloud: Cloud, found: Registration, middle_ns: int) -> None:
+    def _keep(self, cloud: ColumnCloud, found: Registration, middle_ns: int) -> None:
         moved = np.matmul(cloud.moved(found.velocity), found.pose.rotation.T)
         self._map.add(moved + found.pose.position_m)
         self._pose = found.pose
@@ -133,7 +135,7 @@ class VelocityEstimator:
         self._middle_ns = middle_ns
 
 
-def _thinned(cloud: Cloud) -> Cloud:
+def _thinned(cloud: ColumnCloud) -> ColumnCloud:
     """The points to register."""
     rows = first_in_voxels(cloud.points_m, _QUERY_EDGE_M)
     return cloud.take(rows[:: -(-len(rows) // _MOST_QUERIES) or 1])

@@ -61,7 +61,7 @@ ORIGIN = Pose(np.eye(3), np.zeros(3))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Cloud:
+class ColumnCloud:
     """Points (n, 3) of a window in the body frame, m, as measured.
 
     column: (n,), index into time_s; time_s: (c,) of the columns, from the middle of the window.
@@ -71,9 +71,15 @@ class Cloud:
     column: I64Array
     time_s: F64Array
 
-    def take(self, rows: I64Array) -> Cloud:
+    @classmethod
+    def of_points(cls, points_m: F64Array, time_s: F64Array) -> ColumnCloud:
+        """Points (n, 3) at times (n,), those of one time as a column."""
+        times_s, column = np.unique(time_s, return_inverse=True)
+        return cls(points_m, column, times_s)
+
+    def take(self, rows: I64Array) -> ColumnCloud:
         """Some of the points."""
-        return Cloud(self.points_m[rows], self.column[rows], self.time_s)
+        return ColumnCloud(self.points_m[rows], self.column[rows], self.time_s)
 
     def moved(self, velocity: F64Array) -> F64Array:
         """The points at the middle of the window, for a velocity (6,): twist a second."""
@@ -141,7 +147,7 @@ class _Matches:
 
 
 def register(
-    distributions: Distributions, cloud: Cloud, before: Pose, gap_s: float, velocity: F64Array
+    distributions: Distributions, cloud: ColumnCloud, before: Pose, gap_s: float, velocity: F64Array
 ) -> Registration:
     """Register a window; before: pose at the middle of an earlier one, gap_s ago.
 

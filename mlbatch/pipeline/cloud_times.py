@@ -24,13 +24,13 @@ from mlbatch.poses.point_times import (
     OPEN,
     DelayFit,
     OrderFit,
-    Sweep,
     TimedLidar,
     Track,
     fit_delay,
     fit_order,
     track,
 )
+from mlbatch.poses.solve import Cloud
 from mlbatch.ros.point_packets import HEAD, KINDS
 from mlbatch.ros.point_times import BACK, END, START
 from mlbatch.types import PacketBatch
@@ -258,7 +258,7 @@ class _Lidar:
 
     def __init__(self, sensor: DetectedSensor) -> None:
         self.sensor = sensor
-        self.sweeps: deque[Sweep] = deque(maxlen=_SWEEPS)
+        self.sweeps: deque[Cloud] = deque(maxlen=_SWEEPS)
         # Points (k, 3) and stamps (k,) of the message that is read.
         self._parts: list[tuple[F64Array, I64Array]] = []
 
@@ -297,6 +297,6 @@ class _Lidar:
             return
         pose = self.sensor.pose.body_from_sensor
         points_m = np.matmul(points_m[near], pose[:3, :3].T) + pose[:3, 3]
-        sweep = Sweep(points_m, stamp_ns[near])
-        if sweep.span_s > 0 and (not self.sweeps or sweep.middle_ns > self.sweeps[-1].middle_ns):
+        sweep = Cloud.of_sweep(points_m, stamp_ns[near])
+        if sweep.span_s > 0 and (not self.sweeps or sweep.instant_ns > self.sweeps[-1].instant_ns):
             self.sweeps.append(sweep)

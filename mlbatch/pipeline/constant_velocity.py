@@ -19,7 +19,7 @@ from mlbatch.batching.windows import Window
 from mlbatch.decode.decoder import Decoder, ScanHeader
 from mlbatch.motion.estimate import Estimate, VelocityEstimator
 from mlbatch.motion.moves import PoseLine
-from mlbatch.motion.registration import ORIGIN, Cloud
+from mlbatch.motion.registration import ORIGIN, ColumnCloud
 from mlbatch.motion.track import PoseTrack
 from mlbatch.report.motion import MotionLedger, VelocityCounts
 from mlbatch.types import ImuSamples, Message, instant_ns
@@ -33,7 +33,7 @@ _SLOTS = 1 << 16
 class WindowCloud(NamedTuple):
     """The points of a window; start_ns, end_ns: of it; slices: that it was cut to."""
 
-    cloud: Cloud
+    cloud: ColumnCloud
     start_ns: int
     end_ns: int
     slices: list[Window]
@@ -53,7 +53,7 @@ class WindowPoints:
         self._decoder: Decoder | None = None
         # Slices of the window that is not complete, and their points.
         self._slices: list[Window] = []
-        self._clouds: list[Cloud] = []
+        self._clouds: list[ColumnCloud] = []
 
     def add(self, window: Window) -> Iterator[WindowCloud]:
         """Add the next window or slice; yield windows that are complete."""
@@ -85,7 +85,7 @@ class WindowPoints:
         number = self._grid.index_of(window.start_ns) // slices
         return self._grid.bound(number * slices), self._grid.bound((number + 1) * slices)
 
-    def _points(self, window: Window) -> Cloud:
+    def _points(self, window: Window) -> ColumnCloud:
         """Points of some columns; columns of each sensor are taken at equal steps."""
         columns = window.columns
         counts = [int(np.count_nonzero(columns.sensor == one)) for one in range(len(self._slots))]
@@ -105,7 +105,7 @@ class WindowPoints:
         scan = self._decoder.scan(some, header)
         if scan.column is None:
             raise TypeError("expected scans with columns")
-        return Cloud(scan.xyz.astype(np.float64), scan.column.astype(np.int64), time_s)
+        return ColumnCloud(scan.xyz.astype(np.float64), scan.column.astype(np.int64), time_s)
 
 
 class ConstantVelocity:
@@ -180,12 +180,12 @@ class ConstantVelocity:
         velocity.add_window(estimate.reason, slices[0].index)
 
 
-def _joined(clouds: list[Cloud]) -> Cloud:
+def _joined(clouds: list[ColumnCloud]) -> ColumnCloud:
     """The points of all slices of a window."""
     if len(clouds) == 1:
         return clouds[0]
     before = np.cumsum([0, *(len(one.time_s) for one in clouds[:-1])])
-    return Cloud(
+    return ColumnCloud(
         np.concatenate([one.points_m for one in clouds]),
         np.concatenate([one.column + base for one, base in zip(clouds, before, strict=True)]),
         np.concatenate([one.time_s for one in clouds]),

@@ -16,9 +16,10 @@ import numpy as np
 
 from mlbatch.arrays import F64Array, I64Array
 from mlbatch.motion.estimate import VelocityEstimator
-from mlbatch.motion.registration import ORIGIN, Cloud, Pose
+from mlbatch.motion.registration import ORIGIN, ColumnCloud, Pose
 from mlbatch.motion.se3 import exp_rotation, exp_transform, log_rotation, rotated
 from mlbatch.poses.hand_eye import Steps, hand_eye, known_rows
+from mlbatch.poses.solve import Cloud
 from mlbatch.poses.surfaces import planes
 from mlbatch.poses.turning import lidar_turns, turning
 from mlbatch.units import NS_PER_S
@@ -56,21 +57,13 @@ _INSTEAD = (
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class SensorCloud:
-    """Points of one lidar in one window, as measured: (n, 3) in its sensor frame, m; stamp_ns:
-    (n,), int64, common clock."""
-
-    points_m: F64Array
-    stamp_ns: I64Array
-
-
-@dataclass(frozen=True, slots=True, eq=False)
 class MotionWindow:
-    """A window [start_ns, end_ns) with a cloud of each lidar."""
+    """A window [start_ns, end_ns) with a cloud of each lidar, in its sensor frame, times from the
+    middle."""
 
     start_ns: int
     end_ns: int
-    clouds: Sequence[SensorCloud]
+    clouds: Sequence[Cloud]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -194,20 +187,18 @@ class Odometry:
         # Windows around the one that is measured next, and their motion from the one before.
         self._around: deque[_Measured] = deque(maxlen=2 * _REACH + 1)
 
-    def add(self, cloud: SensorCloud, start_ns: int, end_ns: int) -> F64Array:
+    def add(self, cloud: Cloud, start_ns: int, end_ns: int) -> F64Array:
         """Twist (6,) to the window _REACH windows before, from the one before that one.
 
         Middle to middle, m and rad; NaN where it is unknown.
         """
-        every = -(-len(cloud.stamp_ns) // _MOST_POINTS) or 1
+        every = -(-len(cloud.time_s) // _MOST_POINTS) or 1
         points_m = np.asarray(cloud.points_m[::every], np.float64)
         if self._upright is None:
             self._upright = _upright(points_m)
         turn = np.eye(3) if self._upright is None else self._upright
-        stamps, column = np.unique(cloud.stamp_ns[::every], return_inverse=True)
         middle_ns, period_ns = (start_ns + end_ns) // 2, end_ns - start_ns
-        time_s = (stamps - middle_ns) / NS_PER_S
-        upright = Cloud(np.matmul(points_m, turn.T), column, time_s)
+        upright = ColumnCloud.of_points(np.matmul(points_m, turn.T), cloud.time_s[::every])
         velocity = self._rough.add(upright, middle_ns, period_ns).velocity
         self._around.append(_Measured(upright, middle_ns, velocity))
         found = self._measure(period_ns)
@@ -223,7 +214,7 @@ class Odometry:
         curve = self._curve()
         if curve is None:
             return None
-        still = Cloud(
+        still = ColumnCloud(
             _moved_along(window.cloud, *curve), np.zeros_like(window.cloud.column), np.zeros(1)
         )
         velocity = self._fine.add(still, window.middle_ns, period_ns).velocity
@@ -253,12 +244,12 @@ class Odometry:
 class _Measured:
     """A window; velocity: (6,), from the one before, m/s and rad/s."""
 
-    cloud: Cloud
+    cloud: ColumnCloud
     middle_ns: int
     velocity: F64Array | None
 
 
-def _moved_along(cloud: Cloud, times_s: F64Array, twists: F64Array) -> F64Array:
+def _moved_along(cloud: ColumnCloud, times_s: F64Array, twists: F64Array) -> F64Array:
     """Points of a window at its middle, by the polynomial through twists (n, 6) at times (n,)."""
     powers = np.vander(times_s / times_s[-1], increasing=True)
     factors = np.linalg.solve(powers, twists)

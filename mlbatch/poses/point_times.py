@@ -18,10 +18,20 @@ import numpy as np
 
 from mlbatch.arrays import BoolArray, F64Array, I64Array
 from mlbatch.motion.estimate import VelocityEstimator
-from mlbatch.motion.registration import ORIGIN, Pose
-from mlbatch.motion.registration import Cloud as ColumnCloud
+from mlbatch.motion.registration import ORIGIN, ColumnCloud, Pose
 from mlbatch.motion.se3 import exp_rotation, log_rotation
-from mlbatch.poses.solve import FINE, LEVELS, Cloud, Level, Place, Problem, State, moved
+from mlbatch.poses.solve import (
+    FINE,
+    KERNEL,
+    LEVELS,
+    Cloud,
+    Level,
+    Place,
+    Problem,
+    State,
+    after_move,
+    moved,
+)
 from mlbatch.poses.surfaces import distances
 from mlbatch.units import NS_PER_S
 
@@ -68,32 +78,6 @@ _MOST_SIGMA_S = 0.004
 _FLOOR_S = 0.0005
 _SIGMAS = 4.0
 _STEPS = 4
-# Cauchy kernel: residuals of this many standard deviations have half of their weight.
-_KERNEL = 2.5
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Sweep:
-    """A cloud as the driver cut it: points (n, 3) in the body frame, m; stamp_ns (n,), as read."""
-
-    points_m: F64Array
-    stamp_ns: I64Array
-
-    @property
-    def middle_ns(self) -> int:
-        """Between its first and its last point."""
-        return (int(self.stamp_ns.min()) + int(self.stamp_ns.max())) // 2
-
-    @property
-    def span_s(self) -> float:
-        """From its first to its last point."""
-        return (int(self.stamp_ns.max()) - int(self.stamp_ns.min())) / NS_PER_S
-
-    def times_s(self, from_ns: int, order: int = AS_READ) -> F64Array:
-        """Times (n,) from an instant."""
-        middle_ns = self.middle_ns
-        found: F64Array = ((self.stamp_ns - middle_ns) * order + (middle_ns - from_ns)) / NS_PER_S
-        return found
 
 
 @dataclass(frozen=True, slots=True)
@@ -151,24 +135,20 @@ class Track:
         """How far points move from one sweep to the next (n,)."""
         if not len(self.at_ns):
             return np.zeros(len(self.middle_ns))
-        twists = self.twist(self.middle_ns)
-        speed = np.linalg.norm(twists[:, :3], axis=1)
-        found: F64Array = (speed + _FAR_M * np.linalg.norm(twists[:, 3:], axis=1)) * sweep_s
-        return found
+        return _steps_m(self.twist(self.middle_ns)) * sweep_s
 
 
 # -- one lidar -------------------------------------------------------------------------------------
 
 
-def track(sweeps: Sequence[Sweep], order: int = AS_READ) -> Track:
+def track(sweeps: Sequence[Cloud], order: int = AS_READ) -> Track:
     """Motion by sweeps that follow each other, with an order of the times within each."""
     estimator = VelocityEstimator()
     residual_m, at_ns, twists = [], [], []
     before_ns = 0
     for sweep in sweeps:
-        middle_ns = sweep.middle_ns
-        time_s, column = np.unique(sweep.times_s(middle_ns, order), return_inverse=True)
-        cloud = ColumnCloud(sweep.points_m, column, time_s)
+        middle_ns = sweep.instant_ns
+        cloud = ColumnCloud.of_points(sweep.points_m, sweep.time_s * order)
         found = estimator.add(cloud, middle_ns, round(sweep.span_s * NS_PER_S))
         residual_m.append(np.nan if found.residual_m is None else found.residual_m)
         if found.velocity is not None and before_ns:
@@ -177,14 +157,14 @@ def track(sweeps: Sequence[Sweep], order: int = AS_READ) -> Track:
             twists.append(found.velocity)
         before_ns = middle_ns
     return Track(
-        np.array([sweep.middle_ns for sweep in sweeps], np.int64),
+        np.array([sweep.instant_ns for sweep in sweeps], np.int64),
         np.array(residual_m),
         np.array(at_ns, np.int64),
         np.array(twists).reshape(-1, 6),
     )
 
 
-def fit_order(sweeps: Sequence[Sweep], as_read: Track) -> OrderFit:
+def fit_order(sweeps: Sequence[Cloud], as_read: Track) -> OrderFit:
     """Compare the order of the times within the sweeps of one lidar with the opposite one."""
     # The seam may face the sky.
     sweep_s = float(np.percentile([sweep.span_s for sweep in sweeps], 90)) if sweeps else 0.0
@@ -271,7 +251,7 @@ class _Solution:
             columns = np.concatenate([np.arange(7), 7 + 6 * place + np.arange(6)])
             residual = rows.residual / rows.scale
             jacobian = rows.jacobian / rows.scale
-            weighted = jacobian / (1.0 + (residual / _KERNEL) ** 2)[:, None]
+            weighted = jacobian / (1.0 + (residual / KERNEL) ** 2)[:, None]
             normal[np.ix_(columns, columns)] += np.matmul(weighted.T, jacobian)
             by_row = weighted * residual[:, None]
             gradient[columns] += by_row.sum(axis=0)
@@ -287,10 +267,9 @@ class _Solution:
     @staticmethod
     def _after(state: State, step: F64Array) -> State:
         pose = state.corrections[1]
-        turn = exp_rotation(step[None, 3:6])[0]
-        moved_m = np.matmul(turn, pose.position_m) + step[:3]
+        move = Pose(exp_rotation(step[None, 3:6])[0], step[:3])
         return State(
-            [ORIGIN, Pose(np.matmul(turn, pose.rotation), moved_m)],
+            [ORIGIN, after_move(pose, move)],
             state.twists + step[7:].reshape(-1, 6),
             state.delay_s + np.array([0.0, step[6]]),
         )
@@ -305,12 +284,12 @@ def pose_off(pose: Pose) -> F64Array:
 class TimedLidar:
     """Sweeps of a lidar in order of time, and whether their times run back within each."""
 
-    sweeps: Sequence[Sweep]
+    sweeps: Sequence[Cloud]
     is_back: bool
 
-    def nearest(self, instant_ns: int) -> Sequence[Sweep]:
+    def nearest(self, instant_ns: int) -> Sequence[Cloud]:
         """Two sweeps in a row around an instant."""
-        middle_ns = np.array([sweep.middle_ns for sweep in self.sweeps])
+        middle_ns = np.array([sweep.instant_ns for sweep in self.sweeps])
         after = int(np.clip(np.searchsorted(middle_ns, instant_ns), 1, len(middle_ns) - 1))
         return self.sweeps[after - 1 : after + 1]
 
@@ -337,7 +316,8 @@ class _Pair:
                 late_ns = round(late_s * NS_PER_S) if number else 0
                 instant_ns = self.instants_ns[spot] + late_ns
                 for sweep in lidar.nearest(instant_ns):
-                    time_s = sweep.times_s(instant_ns, OPPOSITE if lidar.is_back else AS_READ)
+                    order = OPPOSITE if lidar.is_back else AS_READ
+                    time_s = sweep.time_s * order + (sweep.instant_ns - instant_ns) / NS_PER_S
                     points_m = moved(sweep.points_m, time_s**2 / 2, self.changes[spot])
                     place.append(Cloud(number, points_m, time_s))
             places.append(place)
@@ -412,7 +392,7 @@ def _steps_m(twists: F64Array) -> F64Array:
 def _instants(reference: TimedLidar, lidar: TimedLidar, motion: Track, sweep_s: float) -> I64Array:
     """Instants in the middle of sweeps of the reference, most of them in motion."""
     margin_ns = round(2.5 * sweep_s * NS_PER_S)
-    ends = [(one.sweeps[0].middle_ns, one.sweeps[-1].middle_ns) for one in (reference, lidar)]
+    ends = [(one.sweeps[0].instant_ns, one.sweeps[-1].instant_ns) for one in (reference, lidar)]
     first_ns = max(first for first, _ in ends) + margin_ns
     last_ns = min(last for _, last in ends) - margin_ns
     is_inside = (motion.middle_ns >= first_ns) & (motion.middle_ns <= last_ns)

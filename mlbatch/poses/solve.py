@@ -20,9 +20,10 @@ from mlbatch.motion.se3 import exp_rotation, skew
 from mlbatch.poses.stems import Stems, stem_distances, stems
 from mlbatch.poses.surfaces import Distances, Moments, Planes, distances
 from mlbatch.poses.votes import best_move
+from mlbatch.units import NS_PER_S
 
 # Cauchy kernel: residuals of this many standard deviations have half of their weight.
-_KERNEL = 2.5
+KERNEL = 2.5
 # Observations in one sector of the body frame, and in a ring where radii differ by this factor, are
 # not independent: a tree ahead stays ahead from place to place.
 _SECTORS = 36
@@ -53,14 +54,29 @@ _SMALL_MPS, _SMALL_RADPS = 5e-3, 5e-4
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Cloud:
-    """Points of one lidar in one window: (n, 3) in the body frame, m, as measured; time_s: (n,),
-    from the instant of the place; origin_m: (3,), where the lidar is, as its points were converted
-    (without it stems are not compared)."""
+    """Points of one lidar in one window, or in a sweep as its driver cut it.
+
+    points_m: (n, 3), m, as measured, in the body frame unless said; time_s: (n,), from instant_ns,
+    which counts only if clouds of several instants are compared; origin_m: (3,), where the lidar
+    is, as its points were converted (without it stems are not compared).
+    """
 
     lidar: int
     points_m: F64Array
     time_s: F64Array
     origin_m: F64Array | None = None
+    instant_ns: int = 0
+
+    @classmethod
+    def of_sweep(cls, points_m: F64Array, stamp_ns: I64Array) -> Cloud:
+        """A cloud with stamps (n,), its instant between the first and the last one."""
+        middle_ns = (int(stamp_ns.min()) + int(stamp_ns.max())) // 2
+        return cls(0, points_m, (stamp_ns - middle_ns) / NS_PER_S, None, middle_ns)
+
+    @property
+    def span_s(self) -> float:
+        """From its first to its last point."""
+        return float(np.ptp(self.time_s))
 
 
 # Clouds of windows that follow each other.
@@ -362,7 +378,7 @@ def better_start(places: Sequence[Place], end: State) -> State | None:
     for turn_rad, lidar in turns:
         rotation = exp_rotation(np.array([[0.0, 0.0, turn_rad]]))[0]
         corrections = list(best.corrections)
-        corrections[lidar] = _after_move(corrections[lidar], Pose(rotation, np.zeros(3)))
+        corrections[lidar] = after_move(corrections[lidar], Pose(rotation, np.zeros(3)))
         start = State(corrections, best.twists, best.delay_s)
         state = solve(problem, start, _SEARCH[0]).state
         agreeing = _agreeing(problem, state)
@@ -380,7 +396,7 @@ def _agreeing(problem: Problem, state: State) -> int:
     )
 
 
-def _after_move(pose: Pose, move: Pose) -> Pose:
+def after_move(pose: Pose, move: Pose) -> Pose:
     """A correction, and then a motion."""
     return Pose(
         np.matmul(move.rotation, pose.rotation),
@@ -402,7 +418,7 @@ def _follow_votes(problem: Problem, state: State) -> bool:
         move = best_move(sides)
         if move is not ORIGIN:
             followed = True
-            state.corrections[lidar] = _after_move(state.corrections[lidar], move)
+            state.corrections[lidar] = after_move(state.corrections[lidar], move)
     return followed
 
 
@@ -431,7 +447,7 @@ def _after(problem: Problem, state: State, step: F64Array) -> State:
     parts = _shortened(step[: problem.poses].reshape(-1, problem.each), _LONGEST_M, _LONGEST_RAD)
     for lidar, part in enumerate(parts, 1):
         move = Pose(exp_rotation(part[None, 3:6])[0], part[:3])
-        corrections[lidar] = _after_move(corrections[lidar], move)
+        corrections[lidar] = after_move(corrections[lidar], move)
         if problem.each == 7:
             delay_s[lidar] += part[6]
     twists = _shortened(step[problem.poses :].reshape(-1, 6), _LONGEST_MPS, _LONGEST_RADPS)
@@ -452,7 +468,7 @@ class _Equations:
             self._units[at + 3 : at + 6] = 1.0 / _LEVER_M
         self._residual = [part.residual / part.scale for part in rows]
         # Share of each residual in the kernel.
-        self._off = [(residual / _KERNEL) ** 2 for residual in self._residual]
+        self._off = [(residual / KERNEL) ** 2 for residual in self._residual]
         squares = sum(
             float((residual**2 / (1.0 + off)).sum())
             for residual, off in zip(self._residual, self._off, strict=True)

@@ -32,14 +32,14 @@ from mlbatch.poses.calibration import (
     numbers,
     rounded,
 )
-from mlbatch.poses.from_motion import MotionWindow, SensorCloud, contradiction, poses_from_motion
+from mlbatch.poses.from_motion import MotionWindow, contradiction, poses_from_motion
 from mlbatch.poses.places import LEAST_RANGE_M, MOST_RANGE_M, Places, places_of
-from mlbatch.poses.solve import State
+from mlbatch.poses.solve import Cloud, State
 from mlbatch.python.options import Moment, Names, Paths, session_job, window_job
 from mlbatch.rig.rig import Rig, RigSensor, UnknownExtrinsics, read_rig
 from mlbatch.rig.write import write_rig
 from mlbatch.types import Scan
-from mlbatch.units import NS_PER_MS
+from mlbatch.units import NS_PER_MS, NS_PER_S
 from mlbatch.writers import check_name
 
 # Windows in which a machine moves evenly, Hz.
@@ -199,12 +199,13 @@ def _places(run: Conversion, progress: Progress | None) -> Places:
 def _motion_windows(scans: Iterable[Scan], poses: Sequence[F64Array]) -> Iterator[MotionWindow]:
     """The points of each lidar as it measured them; poses: (4, 4) that they were converted with."""
     for scan in scans:
-        stamp_ns = scan.time_ns.astype(np.int64) + scan.start_ns
+        middle_ns = (scan.start_ns + scan.end_ns) // 2
+        time_s = (scan.time_ns.astype(np.int64) + (scan.start_ns - middle_ns)) / NS_PER_S
         clouds = []
         for lidar, pose in enumerate(poses):
             rows = scan.lidar_id == lidar
             off_m = scan.xyz[rows].astype(np.float64) - pose[:3, 3]
-            clouds.append(SensorCloud(np.matmul(off_m, pose[:3, :3]), stamp_ns[rows]))
+            clouds.append(Cloud(lidar, np.matmul(off_m, pose[:3, :3]), time_s[rows]))
         yield MotionWindow(scan.start_ns, scan.end_ns, clouds)
 
 

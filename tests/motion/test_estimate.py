@@ -13,7 +13,7 @@ import pytest
 
 from mlbatch.arrays import F64Array
 from mlbatch.motion.estimate import FIRST, NO_GAIN, Estimate, VelocityEstimator
-from mlbatch.motion.registration import Cloud
+from mlbatch.motion.registration import ColumnCloud
 
 PERIOD_NS = 100_000_000
 PERIOD_S = 0.1
@@ -45,7 +45,7 @@ def places(planes: list[Plane], rng: np.random.Generator) -> F64Array:
 
 def window(
     planes: list[Plane], number: int, speed: float, turn: float, begin: int = 0
-) -> tuple[Cloud, int]:
+) -> tuple[ColumnCloud, int]:
     """The points of a window with 5 mm of noise, and its middle in ns.
 
     The motion begins with window `begin`, at the origin; speed: m/s; turn: rad/s.
@@ -70,7 +70,7 @@ def window(
     )
     body += rng.normal(0.0, 0.005, body.shape)
     middle_ns = number * PERIOD_NS + PERIOD_NS // 2
-    return Cloud(body, column, column_s - PERIOD_S / 2), middle_ns
+    return ColumnCloud(body, column, column_s - PERIOD_S / 2), middle_ns
 
 
 def estimates(

@@ -20,9 +20,9 @@ from mlbatch.motion.se3 import exp_rotation, log_rotation
 from mlbatch.poses.from_motion import (
     MotionPose,
     MotionWindow,
-    SensorCloud,
     poses_from_motion,
 )
+from mlbatch.poses.solve import Cloud
 from mlbatch.rig.rig import read_rig
 
 # What is required of a pose that is not refused, mm and degrees.
@@ -39,12 +39,13 @@ def windows_of(
     ):
         if not poses:
             poses.extend(_poses(scan, turns))
-        stamp_ns = scan.start_ns + scan.time_ns.astype(np.int64)
+        middle_ns = (scan.end_ns - scan.start_ns) // 2
+        time_s = (scan.time_ns.astype(np.int64) - middle_ns) / 1e9
         clouds = []
         for lidar, pose in enumerate(poses):
             rows = scan.lidar_id == lidar
             off_m = scan.xyz[rows].astype(np.float64) - pose[:3, 3]
-            clouds.append(SensorCloud(off_m @ pose[:3, :3], stamp_ns[rows]))
+            clouds.append(Cloud(lidar, off_m @ pose[:3, :3], time_s[rows]))
         yield MotionWindow(scan.start_ns, scan.end_ns, clouds)
 
 

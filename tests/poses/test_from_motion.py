@@ -13,10 +13,10 @@ from mlbatch.motion.se3 import exp_rotation, log_rotation
 from mlbatch.poses.from_motion import (
     MotionPose,
     Odometry,
-    SensorCloud,
     contradiction,
     poses_of_twists,
 )
+from mlbatch.poses.solve import Cloud
 
 STEPS = 200
 NS = 100_000_000
@@ -195,7 +195,7 @@ def pose_at(time_s: F64Array) -> tuple[F64Array, F64Array]:
     return exp_rotation(vector), place
 
 
-def seen_in_room(start_s: float, mounting: F64Array, seed: int) -> SensorCloud:
+def seen_in_room(start_s: float, mounting: F64Array, seed: int) -> Cloud:
     """A revolution of 0.1 s, in the frame of a lidar that is mounted with a rotation."""
     azimuth = np.repeat(np.arange(360) + 0.3, 32) * (2.0 * math.pi / 360)
     elevation = np.tile(np.linspace(-0.7, 0.7, 32), 360)
@@ -207,7 +207,7 @@ def seen_in_room(start_s: float, mounting: F64Array, seed: int) -> SensorCloud:
     with np.errstate(divide="ignore"):
         range_m = ((np.sign(way) * ROOM_M - place) / way).min(axis=1)
     range_m += np.random.default_rng(seed).normal(size=len(range_m)) * 0.01
-    return SensorCloud(ray * range_m[:, None], np.round(time_s * 1e9).astype(np.int64))
+    return Cloud(0, ray * range_m[:, None], time_s - start_s - 0.05)
 
 
 @pytest.mark.parametrize("vector", [(0.0, 0.0, 0.0), (math.pi, 0.0, 0.0), (0.7, -0.3, 2.0)])

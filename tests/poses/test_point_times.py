@@ -17,12 +17,12 @@ from mlbatch.poses.point_times import (
     FITS,
     MOVED,
     OPEN,
-    Sweep,
     TimedLidar,
     fit_delay,
     fit_order,
     track,
 )
+from mlbatch.poses.solve import Cloud
 from mlbatch.ros.point_packets import CloudError
 from mlbatch.ros.point_times import CONVENTION, Zero, stamps
 from tests.builders.simulated import at_true_poses, read_tum
@@ -46,14 +46,14 @@ def moved(tmp_path_factory: pytest.TempPathFactory) -> Drive:
     return drive(tmp_path_factory.mktemp("drive"), scenario(_SEED, duration_s=3.0), _SEED)
 
 
-def _sweeps(moved: Drive, lidar: int, late_ns: int = 0, *, is_back: bool = False) -> list[Sweep]:
+def _sweeps(moved: Drive, lidar: int, late_ns: int = 0, *, is_back: bool = False) -> list[Cloud]:
     """Sweeps in the body frame, with stamps that are late, or in the opposite order."""
     pose: F64Array = moved.poses[lidar]
     found = []
     for stamp_ns, points_m, start_ns in moved.sweeps[lidar]:
         read_ns = 2 * start_ns + SWEEP_NS - stamp_ns if is_back else stamp_ns
         body_m = np.matmul(points_m, pose[:3, :3].T) + pose[:3, 3]
-        found.append(Sweep(body_m, read_ns + late_ns))
+        found.append(Cloud.of_sweep(body_m, read_ns + late_ns))
     return found
 
 
@@ -76,10 +76,11 @@ def test_points_that_a_driver_moved_to_one_time_are_named(moved: Drive) -> None:
     stamps_ns, poses = read_tum(moved.truth)
     deskewed = []
     for sweep in _sweeps(moved, 0):
-        world_m = at_true_poses(sweep.points_m, sweep.stamp_ns.astype(np.float64), moved.truth)
-        pose = poses[np.searchsorted(stamps_ns, sweep.middle_ns)]
+        stamp_ns = sweep.instant_ns + sweep.time_s * 1e9
+        world_m = at_true_poses(sweep.points_m, stamp_ns, moved.truth)
+        pose = poses[np.searchsorted(stamps_ns, sweep.instant_ns)]
         body_m = np.matmul(world_m - pose[:3], rotations_of(pose[None, 3:])[0])
-        deskewed.append(Sweep(body_m, sweep.stamp_ns))
+        deskewed.append(replace(sweep, points_m=body_m))
     found = fit_order(deskewed, track(deskewed))
     assert found.verdict == MOVED
     assert found.residual_m[2] < found.residual_m[0]
@@ -87,7 +88,7 @@ def test_points_that_a_driver_moved_to_one_time_are_named(moved: Drive) -> None:
 
 def test_at_rest_nothing_is_decided(moved: Drive) -> None:
     first = _sweeps(moved, 0)[0]
-    still = [replace(first, stamp_ns=first.stamp_ns + step * SWEEP_NS) for step in range(20)]
+    still = [replace(first, instant_ns=first.instant_ns + step * SWEEP_NS) for step in range(20)]
     motion = track(still)
     assert fit_order(still, motion).verdict == OPEN
     lidar = TimedLidar(still, is_back=False)
