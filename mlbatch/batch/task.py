@@ -343,7 +343,7 @@ def _attempts(task: Task, log: BinaryIO, stop: threading.Event) -> tuple[int, in
         log.truncate(0)
         code = _run(words_of(task), task, log, stop, watch)
         _check(stop)
-        # A process that was told to end may be complete.
+        # A process that gets a signal at its end may be complete.
         if watch.limit and code not in _FINAL:
             if watch.is_full:
                 _clear(task.folder, kept=(LOG_TXT, STARTED_JSON))
