@@ -67,6 +67,14 @@ class Option:
 CONVERT: Final = (
     Option("rig", PATH, "Input", "Rig file (YAML).", flags=("-r",), metavar="FILE", in_rig=False),
     Option(
+        "dataset",
+        TEXT,
+        "Input",
+        "Rig of a public dataset, by name (mlbatch datasets).",
+        metavar="NAME",
+        in_rig=False,
+    ),
+    Option(
         "metadata",
         PATHS,
         "Input",
@@ -481,7 +489,7 @@ CONVERT: Final = (
 BY_NAME: Final = {option.name: option for option in CONVERT}
 # Options that a batch passes on; it has the others itself, or they suit one session only.
 _NOT_PASSED = (
-    *("output", "rig", "jobs", "only", "overwrite", "resume", "quiet", "verbose"),
+    *("output", "rig", "dataset", "jobs", "only", "overwrite", "resume", "quiet", "verbose"),
     *("report", "html", "dry_run", "shard", "accumulate", "voxel", "crs"),
 )
 BATCH: Final = tuple(option for option in CONVERT if option.name not in _NOT_PASSED)

@@ -35,7 +35,7 @@ def session_key(session: Session, cwd: Path) -> Key:
     """
     files = recordings_of(session)
     stats = [(file.name, file.stat()) for file in files]
-    rig = read_rig(session.rig)
+    rig = read_rig(session.rig, session.inputs)
     sizes = [f"{name} {one.st_size}" for name, one in stats]
     found = {
         "mlbatch": mlbatch.__version__,

@@ -163,14 +163,14 @@ def _absolute(text: str) -> str:
     return text if is_url(text) else str(Path(text).absolute())
 
 
-def read_rig(rig: str | None) -> Rig | None:
+def read_rig(rig: str | None, recordings: Sequence[str] = ()) -> Rig | None:
     """The rig of a session; None without one, in a store, or if `convert` will name a mistake."""
     if rig is None or is_url(rig):
         return None
     from mlbatch.rig import rig as rigs
 
     try:
-        return rigs.read_rig(Path(rig))
+        return rigs.read_rig(Path(rig), [Path(one) for one in recordings if not is_url(one)])
     except RigError:
         return None
 

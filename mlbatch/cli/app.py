@@ -18,6 +18,7 @@ _PATH_TYPES = ("path", "file", "directory")
 # Modules of this package, each with a function of the same name, in the order of `--help`.
 COMMANDS = (
     *("convert", "merge", "batch", "batch-status", "inspect", "compare", "sensors", "verify"),
+    "datasets",
     *("report", "view", "calibrate", "digest", "diff", "extract", "simulate", "schema"),
 )
 

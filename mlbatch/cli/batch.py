@@ -38,6 +38,10 @@ def batch(
         str | None,
         typer.Option("--rig", "-r", help="Rig file (YAML) of all sessions. [default: manifest's]"),
     ] = None,
+    dataset: Annotated[
+        str | None,
+        typer.Option(help="Rig of a public dataset (mlbatch datasets).", metavar="NAME"),
+    ] = None,
     workers: Annotated[int, typer.Option(help="Sessions converted at the same time.")] = 1,
     jobs: Annotated[
         str | None,
@@ -111,8 +115,12 @@ def batch(
     jobs = _jobs(jobs, workers)
     numbers = parse_part(part)
     limits = read_limits(time_limit, disk_limit, "--time-limit, --disk-limit")
+    if dataset is not None:
+        from mlbatch.rig.recipes import rig_of
+
+        rig = str(rig_of(None if rig is None else Path(rig), dataset))
     given = Common(rig, tuple(_given(context, values, jobs)), limits=limits)
-    if rig is not None and not is_url(rig):
+    if rig is not None and dataset is None and not is_url(rig):
         # A mistake in it would fail every session.
         read_rig(Path(rig))
     sessions = chosen(sessions_of(sources, given, say), only or (), numbers)

@@ -21,6 +21,10 @@ def inspect(
             "--rig", "-r", help="Rig file (YAML): its sensors, names and poses.", metavar="FILE"
         ),
     ] = None,
+    dataset: Annotated[
+        str | None,
+        typer.Option(help="Rig of a public dataset, by name (mlbatch datasets).", metavar="NAME"),
+    ] = None,
     whole: Annotated[
         bool,
         typer.Option("--whole", help="Packets, loss and clocks of the whole recording, not 10 s."),
@@ -40,6 +44,10 @@ def inspect(
     from mlbatch.pipeline.inspect import inspect as inspect_recordings
     from mlbatch.readers.inputs import expand
 
+    if dataset is not None:
+        from mlbatch.rig.recipes import rig_of
+
+        rig = rig_of(rig, dataset)
     prints_rig = write_rig == Path("-")
     if prints_rig and as_json:
         from mlbatch.errors import UsageError

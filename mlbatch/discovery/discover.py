@@ -156,7 +156,8 @@ def discover(
     to_convert: raise an error for sensors that cannot be converted: none found, several at one
     address, clocks that cannot be compared. It names what is missing and how to give it.
     """
-    rig = None if selection.rig is None else read_rig(selection.rig)
+    paths = [recording.path for recording in recordings]
+    rig = None if selection.rig is None else read_rig(selection.rig, paths)
     apart = _why_apart(recordings, selection, rig)
     if apart and to_convert:
         raise RecordingError(apart)
@@ -168,7 +169,6 @@ def discover(
     first = FirstSeconds(recordings, table, clouds, cut_clouds=to_convert)
     sampler = first.sampler
     collector = first.metadata
-    paths = [recording.path for recording in recordings]
     calibrations: list[Calibration] = []
     examined: list[Path] = []
     # Every file in the directory would be read by all vendors.

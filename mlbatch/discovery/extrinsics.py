@@ -13,6 +13,7 @@ from collections import Counter
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from decimal import Decimal
+from pathlib import Path
 from typing import Literal, NamedTuple, NoReturn, TypeAlias
 
 import numpy as np
@@ -24,6 +25,7 @@ from mlbatch.frames.naming import Candidate, candidates, named_frame
 from mlbatch.frames.transforms import compose, inverse
 from mlbatch.frames.tree import Chain, Edge, FrameTree, clean, difference, edge_of, some
 from mlbatch.lidar.limits import FAR_POSE_M, MAX_TRANSLATION_M
+from mlbatch.rig.recipes import FOLDER
 from mlbatch.rig.rig import DEFAULT_BODY_FRAME, Rig, UnknownExtrinsics
 from mlbatch.types import Stream, StreamTable
 from mlbatch.units import MM_PER_M, RAD_PER_DEG
@@ -546,6 +548,9 @@ def _refuse_unknown_in_rig(unknown: Mapping[str, str], poses: Mapping[str, Pose]
         "give translation_m and a rotation (a guess is enough for `mlbatch calibrate`, which "
         "refines it)"
     )
+    if place.startswith(str(FOLDER)):
+        recipe = Path(place.partition(".yaml")[0]).name
+        remedy += f" in a copy of the recipe: mlbatch datasets {recipe} > rig.yaml, --rig rig.yaml"
     if poses[name].is_known:
         remedy = f"remove the key to use that of {poses[name].describe()}"
     raise RigError(

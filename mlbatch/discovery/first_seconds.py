@@ -262,14 +262,21 @@ def with_clouds(
 
 def _refuse_points_of_packets(sensors: Sequence[RigSensor], clouds: Collection[str]) -> None:
     """Raise RigError for `points` of a sensor whose topic has no clouds."""
-    for sensor in sensors:
-        if sensor.points is None or sensor.stream is None or sensor.stream.topic in clouds:
-            continue
-        place = next(iter(sensor.points.places.values()), f"sensor {sensor.name}")
-        near = difflib.get_close_matches(sensor.stream.topic, list(clouds), n=1, cutoff=0.0)
+    lacking = {
+        sensor.stream.topic: sensor.points.places
+        for sensor in sensors
+        if sensor.points is not None
+        and sensor.stream is not None
+        and sensor.stream.topic not in clouds
+    }
+    for topic, places in lacking.items():
+        place = next(iter(places.values()), "points")
+        near = difflib.get_close_matches(topic, list(clouds), n=1, cutoff=0.0)
         remedy = f"the nearest topic of clouds is {near[0]}" if near else "remove points"
+        others = [name for name in clouds if name not in near]
+        also = f", others are {', '.join(others)}" if others else ""
         raise RigError(
-            f"{place}: expected decoded clouds on {sensor.stream.topic}, found none; {remedy}"
+            f"{place}: expected decoded clouds on {', '.join(lacking)}, found none; {remedy}{also}"
         )
 
 

@@ -21,6 +21,7 @@ from mlbatch.discovery.sampler import Sampler
 from mlbatch.discovery.types import DetectedSensor, PacketKind
 from mlbatch.errors import RecordingError, RigError
 from mlbatch.frames.naming import GENERIC, namespace
+from mlbatch.frames.tree import some
 from mlbatch.lidar.interface import NAMED_ONLY, Calibration, Evidence, Lidar, ModelFile
 from mlbatch.rig.rig import MAX_NAME, RigSensor, StreamSelector
 from mlbatch.types import StreamTable
@@ -495,9 +496,11 @@ def _silent(
         selector = f" ({expected.selector})" if str(expected.selector) else ""
         which = f"which of {_paths(own)} is its metadata" if own else "its model"
         remedy = "`metadata:`" if own else "`metadata:` or `model:`"
+        streams = {str(sampler.table.streams[kind.stream]) for kind in sampler.kinds}
+        seen = f" (others are of {some(sorted(streams))})" if expected.selector.topic else ""
         raise RigError(
             f"{start} expected a packet of it{selector} in the first 10 seconds, found none to "
-            f"decide {which}; correct its stream, or give {remedy}"
+            f"decide {which}{seen}; correct its stream, or give {remedy}"
         )
     return DetectedSensor(expected.name, lidar, expected.selector, rig=expected.rig)
 

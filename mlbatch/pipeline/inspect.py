@@ -358,6 +358,7 @@ def inspect(
             *_late_notes(discovery, early),
             *measured.other_lidars(discovery),
             *_clock_notes(known),
+            *([] if rig is not None else _dataset_notes(discovery)),
         ),
         clocks=compare(known) if known else None,
         whole=whole,
@@ -405,6 +406,15 @@ def _late_notes(discovery: Discovery, early: Collection[PacketKind]) -> Iterator
                 f"{sampler.table.streams[kind.stream]}: {what}; it started after the first 10 s, "
                 "in which sensors are detected; name the sensor in a rig file (--rig)"
             )
+
+
+def _dataset_notes(discovery: Discovery) -> Iterator[str]:
+    """The public dataset that recordings may be of."""
+    topics = {topic.name for recording in discovery.recordings for topic in recording.topics}
+    if topics:
+        from mlbatch.rig.recipes import by_topics, proposal
+
+        yield from filter(None, [proposal(by_topics(topics))])
 
 
 def _clock_notes(known: Sequence[tuple[str, ClockEstimate]]) -> Iterator[str]:

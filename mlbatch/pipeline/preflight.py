@@ -105,7 +105,7 @@ def _is_limited(job: Job) -> bool:
 def _is_limited_by_rig(job: Job) -> bool:
     """True if the rig can make it arbitrarily small."""
     path = job.selection.rig
-    sensors = () if path is None else read_rig(path).sensors
+    sensors = () if path is None else read_rig(path, job.recordings).sensors
     return any((sensor.max_range_m or math.inf) < math.inf for sensor in sensors)
 
 

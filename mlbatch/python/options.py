@@ -96,6 +96,7 @@ class SessionOptions(TypedDict, total=False):
     """Options that select recordings and sensors, with the names of `mlbatch convert`."""
 
     rig: AnyPath | None
+    dataset: str | None  # a recipe of `mlbatch datasets`
     metadata: Paths
     only: Names
     ignore: Names
@@ -204,6 +205,17 @@ def _as_in_python(name: str) -> str:
     return name
 
 
+def _rig_of(options: SessionOptions, shown: Callable[[str], str]) -> Path | None:
+    rig = path_of("rig", options.get("rig"))
+    dataset = options.get("dataset")
+    if dataset is None:
+        return rig
+    # Few runs have it.
+    from mlbatch.rig.recipes import rig_of
+
+    return rig_of(rig, dataset, shown("dataset"))
+
+
 def session_job(
     recordings: Paths | tuple[Paths, ...],
     options: SessionOptions,
@@ -219,7 +231,7 @@ def session_job(
     return Job(
         recordings=recordings_of(recordings),
         selection=SensorSelection(
-            rig=path_of("rig", options.get("rig")),
+            rig=_rig_of(options, shown),
             metadata=paths_of("metadata", options.get("metadata", ())),
             only=names_of(options.get("only", ())),
             ignore=names_of(options.get("ignore", ())),

@@ -85,7 +85,7 @@ def open_recordings(
         # Not loaded for captures.
         from mlbatch.rig.rig import read_rig
 
-        sensors = [sensor for sensor in read_rig(rig).sensors if sensor.sweeps is not None]
+        sensors = [sensor for sensor in read_rig(rig, paths).sensors if sensor.sweeps is not None]
         if sensors:
             from mlbatch.readers.sweeps import open_with_sweeps
 

@@ -72,7 +72,7 @@ DATASET_FILES = (
         (".npz",),
         b"",
         "numpy arrays (.npz), as the points of A2D2",
-        "write points and times as .bin files and describe them in a rig",
+        "describe its folder in a rig (points: {glob: '*.npz', arrays: {x: points.0, t: times}})",
     ),
 )
 
@@ -90,6 +90,11 @@ def found_in_file(path: Path, head: bytes) -> str:
 
 def found_in_folder(folder: Path) -> str:
     """The same for a folder without recordings, by most of its files; "" without known ones."""
+    from mlbatch.rig.recipes import by_files, proposal
+
+    known = proposal(by_files(folder))
+    if known:
+        return f"found a folder of files; {known}"
     names = [path.name.lower() for path in _some_files(folder)]
     counts = [sum(name.endswith(one.suffixes) for name in names) for one in DATASET_FILES]
     most = max(counts, default=0)

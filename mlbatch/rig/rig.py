@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from fractions import Fraction
 from pathlib import Path
@@ -19,6 +20,8 @@ if TYPE_CHECKING:
 DEFAULT_BODY_FRAME = "base_link"
 # Letters of the name of a sensor, which is that of a folder.
 MAX_NAME = 100
+# Key of the facts about a public dataset, in its recipe.
+DATASET = "dataset"
 # Fields of `StreamSelector`, and keys of `stream` in the file.
 STREAM_FIELDS = ("source_ip", "port", "topic", "serial", "frame_id", "lidar_id")
 
@@ -62,13 +65,15 @@ class UnknownExtrinsics(NamedTuple):
 class Sweeps(NamedTuple):
     """Files of a sensor, one per sweep, in the folder that is given as recording.
 
-    glob: pattern in the folder, and topic of the sensor; fields: name and numpy type of each field
-    of a point, empty: PCD; place: file, line and key path of the pattern.
+    glob: pattern in the folder, and topic of the sensor, `{stamp:us}` is the time in the name;
+    fields: name and numpy type of each field of a point, empty: the file states them; place: file,
+    line and key path of the pattern; arrays: field and array of a .npz file.
     """
 
     glob: str
     fields: tuple[tuple[str, str], ...]
     place: str = ""
+    arrays: tuple[tuple[str, str], ...] = ()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -120,10 +125,18 @@ class Rig:
     options: tuple[RigOption, ...] = ()
 
 
-def read_rig(path: Path) -> Rig:
-    """Read a rig file; RigError names file, line and key of the first mistake."""
+def read_rig(path: Path, recordings: Sequence[Path] = ()) -> Rig:
+    """Read a rig file; RigError names file, line and key of the first mistake.
+
+    recordings: files that the recipe of a dataset names are searched around them.
+    """
     # Imported on demand: most runs have no rig and need no YAML parser.
     from mlbatch.rig.schema import rig_from
     from mlbatch.rig.yaml_tree import read_yaml
 
-    return rig_from(read_yaml(Path(path)))
+    root = read_yaml(Path(path))
+    if DATASET in root.entries:
+        from mlbatch.rig.recipes import with_files
+
+        root = with_files(root, recordings)
+    return rig_from(root)

@@ -37,6 +37,7 @@ from mlbatch.rig.keys import (
     text_form,
     whole_form,
 )
+from mlbatch.rig.recipes import DATASET_KEY
 from mlbatch.rig.rig import (
     DEFAULT_BODY_FRAME,
     MAX_NAME,
@@ -158,11 +159,20 @@ def _sweeps(node: Node) -> Sweeps | None:
     fields = node.entries
     if "glob" not in fields:
         return None
-    return Sweeps(_GLOB.of(fields), _DTYPE.of(fields), fields["glob"].place)
+    return Sweeps(
+        _GLOB.of(fields), _DTYPE.of(fields), fields["glob"].place, tuple(_ARRAYS.of(fields).items())
+    )
 
 
 def _glob(node: Node) -> str:
     text = node.word("a pattern of files, as Ouster/*.bin", _WORD)
+    parts = _NAMED_PARTS.findall(text)
+    units = ", ".join(f"{{stamp:{unit}}}" for unit in ("s", "ms", "us", "ns", "iso"))
+    if [part for part in parts if not _NAMED_PART.fullmatch(part)] or len(
+        [part for part in parts if part != "{sensor}"]
+    ) > 1:
+        found = ", ".join(parts)
+        raise node.error(f"one of {{stamp}}, {units}, and {{sensor}}", found, "write * for others")
     if text.startswith("/") or ".." in text.split("/"):
         remedy = "give the folder as recording, and the pattern relative to it"
         raise node.error("a pattern within the folder of the recording", node.shown, remedy)
@@ -349,9 +359,11 @@ _POINT_ORIGIN = Key(
     "the header's stamp is that of the first point, of the last one; times are ages; or from 1970",
 )
 _POINT_RING = Key("ring", _word("the name of a field"), "", WORD, "field with the ring of a point")
-# Of a sensor_msgs/PointField.
-FIELD_TYPES = ("i1", "u1", "i2", "u2", "i4", "u4", "f4", "f8")
+# Of a sensor_msgs/PointField, and whole numbers of 64 bits.
+FIELD_TYPES = ("i1", "u1", "i2", "u2", "i4", "u4", "i8", "u8", "f4", "f8")
 _PADDING = re.compile(r"V([1-9]\d{0,3})", re.ASCII)
+_NAMED_PARTS = re.compile(r"\{[^}]*\}?")
+_NAMED_PART = re.compile(r"\{(sensor|stamp(:(s|ms|us|ns|iso))?)\}")
 _GLOB = Key("glob", _glob, "", WORD, "files of sweeps in the folder of the recording")
 _DTYPE: Key[tuple[tuple[str, str], ...]] = Key(
     "dtype",
@@ -364,7 +376,14 @@ _DTYPE: Key[tuple[tuple[str, str], ...]] = Key(
     },
     "fields of a point in the files, and their numpy types, in order; PCD states its own",
 )
-_POINTS_KEYS = (_POINT_TIME, _POINT_UNIT, _POINT_ORIGIN, _POINT_RING, _GLOB, _DTYPE)
+_ARRAYS: Key[dict[str, str]] = Key(
+    "arrays",
+    _options,
+    {},
+    {"type": "object", "additionalProperties": WORD, "minProperties": 1},
+    "array of a .npz file for each field of a point; points.0: its first column",
+)
+_POINTS_KEYS = (_POINT_TIME, _POINT_UNIT, _POINT_ORIGIN, _POINT_RING, _GLOB, _DTYPE, _ARRAYS)
 
 _CLOCK_SOURCE: Key[str | None] = Key(
     "source",
@@ -451,6 +470,7 @@ _NEEDS = {
     "matrix_unit": "key",
     "sensor_in_frame": "file",
     "dtype": "glob",
+    "arrays": "glob",
 }
 # Keys of streams and extrinsics that exclude others.
 _EXCLUDES = {
@@ -460,6 +480,7 @@ _EXCLUDES = {
     "topic": ("source_ip", "port"),
     "file": ("translation_m", "rotation_rpy_deg", "rotation_xyzw", "matrix"),
     "key": ("frame", "parent"),
+    "arrays": ("dtype",),
 }
 _SENSOR_IN_FRAME: Key[F64Array | None] = Key(
     "sensor_in_frame",
@@ -577,7 +598,7 @@ _CONVERT: Key[tuple[RigOption, ...]] = Key(
     convert_keys.FORM,
     "options of `mlbatch convert`; the command line overrides them",
 )
-_RIG_KEYS = (_BODY_FRAME, _RATE, _SENSORS, _BOXES, _CONVERT)
+_RIG_KEYS = (_BODY_FRAME, _RATE, _SENSORS, _BOXES, _CONVERT, DATASET_KEY)
 _REQUIRED = ("sensors",)
 
 
@@ -622,6 +643,7 @@ def _sensor(node: Node, body_frame: str) -> RigSensor:
         if "stream" in fields:
             found = f"glob as well (line {fields['points'].entries['glob'].line})"
             raise fields["stream"].error("a stream without glob", found, "keep one of the two")
+        sweeps = sweeps._replace(glob=sweeps.glob.replace("{sensor}", _SENSOR_NAME.of(fields)))
         stream = StreamSelector(topic=sweeps.glob)
     given = _EXTRINSICS.of(fields)
     extrinsics, files = _of_files(given, body_frame, "" if stream is None else stream.serial)

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 from mlbatch.arrays import F64Array
 from mlbatch.frames.transforms import from_rpy_deg, rpy_deg
 from mlbatch.rig.convert_keys import POSE_MODELS, RigOption
-from mlbatch.rig.rig import Rig, RigSensor, StreamSelector, Sweeps, UnknownExtrinsics
+from mlbatch.rig.rig import Rig, RigSensor, StreamSelector, UnknownExtrinsics
 from mlbatch.units import NS_PER_S, rate_text
 
 # Text that needs no quotes, for any reader of YAML.
@@ -90,12 +90,13 @@ def _sensor_lines(sensor: RigSensor, folder: Path) -> Iterator[str]:
         points = {key: _text(value) for key, value in sensor.points.keys().items() if value}
         if sensor.sweeps is not None:
             points["glob"] = _text(sensor.sweeps.glob)
-            points["dtype"] = _dtype_text(sensor.sweeps)
+            points["dtype"] = _fields_text(sensor.sweeps.fields)
+            points["arrays"] = _fields_text(sensor.sweeps.arrays)
         yield "points: " + _braces(points)
 
 
-def _dtype_text(sweeps: Sweeps) -> str:
-    fields = {_text(name): _text(kind) for name, kind in sweeps.fields}
+def _fields_text(pairs: Sequence[tuple[str, str]]) -> str:
+    fields = {_text(name): _text(kind) for name, kind in pairs}
     return _braces(fields) if fields else ""
 
 

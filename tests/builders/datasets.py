@@ -1,25 +1,25 @@
-"""Small look-alikes of public datasets, by their published definitions (docs/datasets.md).
+"""Small look-alikes of public datasets, from the layouts that their pages publish.
 
-Every lidar measures one place, (1, 0, 0) in its own frame, from START_NS on: sweeps of 100 ms with
-a column each ms. So its points in the body are R (1, 0, 0) + t, by hand, at known times.
+Written by the libraries `rosbags` and numpy alone: nothing here is shared with the builders of the
+readers' tests, or with the package. Every lidar measures one place, (1, 0, 0) in its own frame,
+from START_NS on: sweeps of 100 ms with a column each ms. So its points in the body are
+R (1, 0, 0) + t, by hand, at known times.
 """
 
 from __future__ import annotations
 
 import gzip
+import json
 from collections.abc import Callable, Mapping, Sequence
+from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-
-from mlbatch.simulate.velodyne.encode import VelodyneSpec
-from tests.builders.bags import Body, Recorded, transforms_message
-from tests.builders.points import CLOUD, CUSTOM, Form, cloud_message, custom_message
-from tests.builders.rosbag1 import write_rosbag1
-from tests.builders.rosbag2 import write_folder
-from tests.builders.sweeps import pcd, raw, write_sweeps
-from tests.builders.vendor_sessions import lidar_payloads
+from rosbags.rosbag1 import Writer as Writer1
+from rosbags.rosbag2 import StoragePlugin
+from rosbags.rosbag2 import Writer as Writer2
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 MS = 1_000_000
 START_NS = 1_700_000_000_000_000_000
@@ -30,135 +30,276 @@ SWEEPS = 6
 LAST = (COLUMNS - 1) * MS
 # Half of a right angle: the quaternion of a quarter about z is (0, 0, H, H).
 H = 0.7071067811865476
-SCAN = "velodyne_msgs/VelodyneScan"
-XYZI = {"x": "float32", "y": "float32", "z": "float32", "intensity": "float32"}
-# Fields by driver, in their order.
-OUSTER = {**XYZI, "t": "uint32", "reflectivity": "uint16", "ring": "uint16", "ambient": "uint16"}
-MCD = {
-    **XYZI,
-    "t": "uint32",
-    "reflectivity": "uint16",
-    "ambient": "uint16",
-    "range": "uint32",
-    "ring": "uint8",
+
+# By the repositories ros-drivers/velodyne, Livox-SDK/livox_ros_driver, ros/geometry2.
+_DEFINITIONS = {
+    "velodyne_msgs/msg/VelodynePacket": "time stamp\nuint8[1206] data\n",
+    "velodyne_msgs/msg/VelodyneScan": "std_msgs/Header header\nVelodynePacket[] packets\n",
+    "livox_ros_driver/msg/CustomPoint": "uint32 offset_time\nfloat32 x\nfloat32 y\nfloat32 z\n"
+    "uint8 reflectivity\nuint8 tag\nuint8 line\n",
+    "tf2_msgs/msg/TFMessage": "geometry_msgs/TransformStamped[] transforms\n",
+    "livox_ros_driver/msg/CustomMsg": "std_msgs/Header header\nuint64 timebase\n"
+    "uint32 point_num\nuint8 lidar_id\nuint8[3] rsvd\nCustomPoint[] points\n",
 }
-VELODYNE = {**XYZI, "ring": "uint16", "time": "float32"}
-HESAI = {**XYZI, "ring": "uint16", "timestamp": "float64"}
-LIVOX2 = {**XYZI, "tag": "uint8", "line": "uint8", "timestamp": "float64"}
+ROS1 = get_typestore(Stores.ROS1_NOETIC)
+ROS2 = get_typestore(Stores.ROS2_HUMBLE)
+for _store in (ROS1, ROS2):
+    for _name, _text in _DEFINITIONS.items():
+        _store.register(get_types_from_msg(_text, _name))
+
+# Messages of a topic: type, and log time with the message.
+Topic = tuple[str, str, list[tuple[int, Any]]]
+Times = Callable[[Any, int], Any]
+
+# sensor_msgs/PointField.
+_DATATYPES = {"i1": 1, "u1": 2, "i2": 3, "u2": 4, "i4": 5, "u4": 6, "f4": 7, "f8": 8}
+XYZI = {"x": "f4", "y": "f4", "z": "f4", "intensity": "f4"}
+OUSTER = {**XYZI, "t": "u4", "reflectivity": "u2", "ring": "u2", "ambient": "u2"}
+# The types that the manuals of NTU VIRAL and MCD publish.
+NTU = {**XYZI, "t": "u4", "reflectivity": "u2", "ring": "u1", "noise": "u2", "range": "u4"}
+MCD = {**XYZI, "t": "u4", "reflectivity": "u2", "ambient": "u2", "range": "u4", "ring": "u1"}
+VELODYNE = {**XYZI, "ring": "u2", "time": "f4"}
+HESAI = {**XYZI, "ring": "u2", "timestamp": "f8"}
+LIVOX2 = {**XYZI, "tag": "u1", "line": "u1", "timestamp": "f8"}
+_TIMES = ("t", "time", "timestamp", "offset_time", "time_offset_ns")
+
+# Time of a column of a sweep that starts at a time, as a dataset has it.
+after_start_ns: Times = lambda column, start_ns: column * MS  # noqa: E731
+after_start_s: Times = lambda column, start_ns: column / 1000  # noqa: E731
+before_end_s: Times = lambda column, start_ns: (column * MS - LAST) / 1e9  # noqa: E731
+since_1970_s: Times = lambda column, start_ns: (start_ns + column * MS) / 1e9  # noqa: E731
+since_1970_ns: Times = lambda column, start_ns: (start_ns + column * MS) * 1.0  # noqa: E731
+since_1970_us: Times = lambda column, start_ns: start_ns // 1000 + column * 1000  # noqa: E731
 
 
-def _points(
-    fields: Sequence[str], time: Callable[[int, int], float], start_ns: int
-) -> list[tuple[float, ...]]:
-    """A sweep; time: of a column of one that starts at a time, as the dataset has it."""
-    names = ("t", "time", "timestamp", "offset_time", "time_offset_ns")
-    found = []
-    for column in range(COLUMNS):
-        for ring in range(RINGS):
-            values = {"x": 1.0, "intensity": 9, "ring": ring, "line": ring, "line_index": ring}
-            found.append(
-                tuple(time(column, start_ns) if f in names else values.get(f, 0) for f in fields)
-            )
+def rows(fields: Mapping[str, str], time: Times, start_ns: int = 0) -> Any:
+    """The points of a sweep as a structured array."""
+    column = np.repeat(np.arange(COLUMNS), RINGS)
+    found = np.zeros(COLUMNS * RINGS, [(name, f"<{kind}") for name, kind in fields.items()])
+    found["x"] = 1.0
+    for name in fields:
+        if name in _TIMES:
+            found[name] = time(column, start_ns)
+        elif name in ("ring", "line", "line_index", "diode_index"):
+            found[name] = np.tile(np.arange(RINGS), COLUMNS)
+        elif name == "intensity":
+            found[name] = 9
     return found
+
+
+def starts(of: int = SWEEPS) -> list[int]:
+    """When the sweeps start."""
+    return [START_NS + number * SWEEP for number in range(of)]
+
+
+def _make(store: Any, kind: str, /, **fields: Any) -> Any:
+    return store.types[kind](**fields)
+
+
+def _header(store: Any, stamp_ns: int, frame: str) -> Any:
+    seconds, rest = divmod(stamp_ns, 10**9)
+    stamp = _make(store, "builtin_interfaces/msg/Time", sec=seconds, nanosec=rest)
+    seq = {"seq": 0} if store is ROS1 else {}
+    return _make(store, "std_msgs/msg/Header", stamp=stamp, frame_id=frame, **seq)
+
+
+def cloud(points: Any, stamp_ns: int, frame: str = "") -> Any:
+    """A PointCloud2 of a structured array."""
+    fields = [
+        _make(
+            ROS1,
+            "sensor_msgs/msg/PointField",
+            name=name,
+            offset=offset,
+            count=1,
+            datatype=_DATATYPES[dtype.str[1:]],
+        )
+        for name, (dtype, offset, *_) in points.dtype.fields.items()
+    ]
+    data = np.frombuffer(points.tobytes(), np.uint8)
+    return _make(
+        ROS1,
+        "sensor_msgs/msg/PointCloud2",
+        header=_header(ROS1, stamp_ns, frame),
+        height=1,
+        width=len(points),
+        fields=fields,
+        is_bigendian=False,
+        point_step=points.dtype.itemsize,
+        row_step=len(data),
+        data=data,
+        is_dense=True,
+    )
 
 
 def clouds(
     topic: str,
     fields: Mapping[str, str],
-    time: Callable[[int, int], float],
+    time: Times,
     *,
     frame: str = "",
     header_ns: int = 0,
     clock_ns: int = 0,
-    delay_ns: int = SWEEP,
-) -> list[Recorded]:
-    """Clouds of a ROS 1 topic; time: of a column of a sweep that starts at a time, ns.
-
-    header_ns: stamp of the header after the start; clock_ns: of the lidar minus the true time;
-    delay_ns: log time after the start.
-    """
-    found = []
-    for number in range(SWEEPS):
-        start_ns = START_NS + number * SWEEP
-        points = _points(list(fields), time, start_ns + clock_ns)
-        data = cloud_message(
-            list(fields.items()),
-            points,
-            start_ns + header_ns + clock_ns,
-            Form(encoding="ros1", frame=frame),
+) -> Topic:
+    """Clouds of a topic; header_ns: after the start of the sweep; clock_ns: minus the true time."""
+    messages = [
+        (
+            start + SWEEP,
+            cloud(rows(fields, time, start + clock_ns), start + header_ns + clock_ns, frame),
         )
-        found.append(Recorded(topic, CLOUD, start_ns + delay_ns, data))
-    return found
+        for start in starts()
+    ]
+    return topic, "sensor_msgs/msg/PointCloud2", messages
 
 
-def after_start_ns(column: int, start_ns: int) -> float:
-    """Ouster: ns after the start of the sweep."""
-    return column * MS
-
-
-def after_start_s(column: int, start_ns: int) -> float:
-    """Velodyne in files: s after the start of the sweep."""
-    return column / 1000
-
-
-def before_end_s(column: int, start_ns: int) -> float:
-    """Velodyne: s up to the header's stamp, that of the last point."""
-    return (column * MS - LAST) / 1e9
-
-
-def since_1970_s(column: int, start_ns: int) -> float:
-    """HESAI: s since 1970."""
-    return (start_ns + column * MS) / 1e9
-
-
-def since_1970_ns(column: int, start_ns: int) -> float:
-    """Livox clouds: ns since 1970."""
-    return float(start_ns + column * MS)
-
-
-def customs(topic: str, clock_ns: int = 0) -> list[Recorded]:
+def customs(topic: str, clock_ns: int = 0) -> Topic:
     """Livox CustomMsg: ns after the start."""
-    found = []
-    for number in range(SWEEPS):
-        start_ns = START_NS + number * SWEEP
+    messages = []
+    for start in starts():
         points = [
-            (column * MS, 1.0, 0.0, 0.0, 9, 0, line)
+            _make(
+                ROS1,
+                "livox_ros_driver/msg/CustomPoint",
+                offset_time=column * MS,
+                x=1.0,
+                y=0.0,
+                z=0.0,
+                reflectivity=9,
+                tag=0,
+                line=line,
+            )
             for column in range(COLUMNS)
             for line in range(RINGS)
         ]
-        stamp_ns = start_ns + clock_ns
-        data = custom_message(points, stamp_ns, stamp_ns, "ros1")
-        found.append(Recorded(topic, CUSTOM, start_ns + SWEEP, data))
-    return found
+        stamp_ns = start + clock_ns
+        messages.append(
+            (
+                start + SWEEP,
+                _make(
+                    ROS1,
+                    "livox_ros_driver/msg/CustomMsg",
+                    header=_header(ROS1, stamp_ns, ""),
+                    timebase=stamp_ns,
+                    point_num=len(points),
+                    lidar_id=0,
+                    rsvd=np.zeros(3, np.uint8),
+                    points=points,
+                ),
+            )
+        )
+    return topic, "livox_ros_driver/msg/CustomMsg", messages
 
 
 # A VelodyneScan of so many packets, about a sixth of a revolution.
 SCAN_PACKETS = 12
 SCANS = 60
+RAW = SCAN_PACKETS * SCANS
 HOUR_NS = 3600 * 10**9
+# Return mode and product, bytes 1204 and 1205; us of a packet; all by the manuals of Velodyne.
+PRODUCTS = {"HDL-32E": (0x21, 552.96), "VLP-16": (0x22, 1327.104), "VLS-128": (0xA1, 160.0)}
+_READINGS = np.dtype([("range", "<u2"), ("level", "u1")])
+_PACKET = np.dtype(
+    [
+        ("blocks", [("flag", "<u2"), ("azimuth", "<u2"), ("readings", _READINGS, 32)], 12),
+        ("us", "<u4"),
+        ("factory", "u1", 2),
+    ]
+)
 
 
-def velodyne_scans(topic: str, model: str, encoding: str, frame: str) -> list[Recorded]:
-    """Raw packets of a Velodyne in scans."""
-    spec = VelodyneSpec(model, hour=START_NS // HOUR_NS, start_us=START_NS % HOUR_NS / 1000)
-    payloads = lidar_payloads(spec, SCAN_PACKETS * SCANS)
-    found = []
+def scans(topic: str, model: str, frame: str, store: Any = ROS1) -> Topic:
+    """Raw packets of a Velodyne at 10 Hz, all ranges alike."""
+    product, packet_us = PRODUCTS[model]
+    # VLS-128: four blocks of 32 beams fire at one azimuth, with flags of their own.
+    flags = [0xEEFF, 0xDDFF, 0xCCFF, 0xBBFF] * 3 if model == "VLS-128" else [0xEEFF] * 12
+    messages = []
     for number in range(SCANS):
-        part = payloads[number * SCAN_PACKETS : (number + 1) * SCAN_PACKETS]
-        body = Body(encoding).header(part[0][0], frame).put("I", len(part))
-        for host_ns, payload in part:
-            if body.cdr:
-                body.raw(bytes(-len(body.data) % 4))
-            body.time(host_ns).raw(payload)
-        found.append(Recorded(topic, SCAN, part[-1][0] + MS, body.done()))
-    return found
+        packets = []
+        for index in range(number * SCAN_PACKETS, (number + 1) * SCAN_PACKETS):
+            packet = np.zeros((), _PACKET)
+            at_us = index * packet_us
+            step_us = packet_us / 12
+            fired = np.arange(12) // (4 if model == "VLS-128" else 1)
+            first_us = at_us + fired * (step_us * (4 if model == "VLS-128" else 1))
+            packet["blocks"]["flag"] = flags
+            packet["blocks"]["azimuth"] = (first_us / 1e5 * 36000).astype(int) % 36000
+            packet["blocks"]["readings"]["range"] = 2000
+            packet["blocks"]["readings"]["level"] = 50
+            packet["us"] = int(START_NS % HOUR_NS / 1000 + at_us)
+            packet["factory"] = (0x37, product)
+            seconds, rest = divmod(START_NS + round((at_us + packet_us) * 1000), 10**9)
+            packets.append(
+                _make(
+                    store,
+                    "velodyne_msgs/msg/VelodynePacket",
+                    stamp=_make(store, "builtin_interfaces/msg/Time", sec=seconds, nanosec=rest),
+                    data=np.frombuffer(packet.tobytes(), np.uint8),
+                )
+            )
+        last_ns = seconds * 10**9 + rest
+        messages.append(
+            (
+                last_ns + MS,
+                _make(
+                    store,
+                    "velodyne_msgs/msg/VelodyneScan",
+                    header=_header(store, last_ns, frame),
+                    packets=packets,
+                ),
+            )
+        )
+    return topic, "velodyne_msgs/msg/VelodyneScan", messages
 
 
-def bag(name: str, *topics: Sequence[Recorded]) -> None:
+def transforms(edges: Sequence[tuple[str, str, tuple[float, ...], tuple[float, ...]]]) -> Topic:
+    """/tf_static: parent, child, translation and quaternion of each."""
+    found = []
+    for parent, child, origin, xyzw in edges:
+        moved = _make(
+            ROS1,
+            "geometry_msgs/msg/Transform",
+            translation=_make(
+                ROS1, "geometry_msgs/msg/Vector3", **dict(zip("xyz", origin, strict=True))
+            ),
+            rotation=_make(
+                ROS1, "geometry_msgs/msg/Quaternion", **dict(zip("xyzw", xyzw, strict=True))
+            ),
+        )
+        found.append(
+            _make(
+                ROS1,
+                "geometry_msgs/msg/TransformStamped",
+                transform=moved,
+                header=_header(ROS1, START_NS, parent),
+                child_frame_id=child,
+            )
+        )
+    message = _make(ROS1, "tf2_msgs/msg/TFMessage", transforms=found)
+    return "/tf_static", "tf2_msgs/msg/TFMessage", [(START_NS, message)]
+
+
+def bag(name: str, *topics: Topic) -> None:
     """A ROS 1 bag in the order of log times."""
-    messages = sorted((one for topic in topics for one in topic), key=lambda one: one.log_ns)
     Path(name).parent.mkdir(parents=True, exist_ok=True)
-    write_rosbag1(Path(name), messages, chunk_bytes=1_000_000)
+    with Writer1(Path(name)) as writer:
+        messages = [
+            (log_ns, number, writer_topic, kind, message)
+            for number, ((topic, kind, some), writer_topic) in enumerate(
+                (one, writer.add_connection(one[0], one[1], typestore=ROS1)) for one in topics
+            )
+            for log_ns, message in some
+        ]
+        for log_ns, _, connection, kind, message in sorted(messages, key=lambda one: one[:2]):
+            writer.write(connection, log_ns, ROS1.serialize_ros1(message, kind))
+
+
+def folder(name: str, *topics: Topic) -> None:
+    """A ROS 2 bag in the order of log times."""
+    with Writer2(Path(name), version=9, storage_plugin=StoragePlugin.SQLITE3) as writer:
+        known = {one[0]: writer.add_connection(one[0], one[1], typestore=ROS2) for one in topics}
+        messages = [(log, topic, kind, one) for topic, kind, some in topics for log, one in some]
+        for log_ns, topic, kind, message in sorted(messages, key=lambda one: one[:2]):
+            writer.write(known[topic], log_ns, ROS2.serialize_cdr(message, kind))
 
 
 def text(name: str, content: str) -> None:
@@ -167,27 +308,51 @@ def text(name: str, content: str) -> None:
     Path(name).write_text(content)
 
 
-def opencv(name: str, **matrices: Sequence[float]) -> None:
+def opencv(name: str, head: str = "%YAML:1.0\n---\n", **matrices: Sequence[float]) -> None:
     """A file of OpenCV matrices."""
-    parts = ["%YAML:1.0\n---\n"]
+    parts = [head]
     for key, values in matrices.items():
-        rows = len(values) // 4
         data = ", ".join(map(repr, values))
-        parts.append(
-            f"{key}: !!opencv-matrix\n   rows: {rows}\n   cols: 4\n   dt: d\n   data: [{data}]\n"
-        )
+        parts.append(f"{key}: !!opencv-matrix\n   rows: {len(values) // 4}\n   cols: 4\n   dt: d\n")
+        parts.append(f"   data: [{data}]\n")
     text(name, "".join(parts))
 
 
-# A quarter about z at a place, and no rotation at a place, by rows.
 def quarter(x: float, y: float, z: float) -> list[float]:
-    """R (1, 0, 0) = (0, 1, 0)."""
+    """A quarter about z at a place, by rows: R (1, 0, 0) = (0, 1, 0)."""
     return [0.0, -1.0, 0.0, x, 1.0, 0.0, 0.0, y, 0.0, 0.0, 1.0, z, 0.0, 0.0, 0.0, 1.0]
 
 
 def upright(x: float, y: float, z: float) -> list[float]:
-    """R (1, 0, 0) = (1, 0, 0)."""
+    """No rotation at a place, by rows."""
     return [1.0, 0.0, 0.0, x, 0.0, 1.0, 0.0, y, 0.0, 0.0, 1.0, z, 0.0, 0.0, 0.0, 1.0]
+
+
+def files(folder: str, name: Callable[[int], str], data: Callable[[int], bytes]) -> None:
+    """A file for each sweep, by its start."""
+    Path(folder).mkdir(parents=True, exist_ok=True)
+    for start in starts():
+        (Path(folder) / name(start)).write_bytes(data(start))
+
+
+def pcd(points: Any) -> bytes:
+    """A binary PCD file."""
+    kinds = [points.dtype[name] for name in points.dtype.names]
+    lines = (
+        "# .PCD v0.7 - Point Cloud Data file format",
+        "VERSION 0.7",
+        "FIELDS " + " ".join(points.dtype.names),
+        "SIZE " + " ".join(str(kind.itemsize) for kind in kinds),
+        "TYPE " + " ".join(kind.kind.upper() for kind in kinds),
+        "COUNT " + " ".join("1" for _ in kinds),
+        f"WIDTH {len(points)}",
+        "HEIGHT 1",
+        "VIEWPOINT 0 0 0 1 0 0 0",
+        f"POINTS {len(points)}",
+        "DATA binary",
+    )
+    data: bytes = points.tobytes()
+    return ("\n".join(lines) + "\n").encode() + data
 
 
 # -- datasets -------------------------------------------------------------------------------------
@@ -195,17 +360,15 @@ def upright(x: float, y: float, z: float) -> list[float]:
 
 def autoware() -> None:
     """VelodyneScan of three lidars, and the calibration of the sample sensor kit."""
-    messages = [
-        message
-        for place, model in (("top", "VLS-128"), ("left", "VLP-16"), ("right", "VLP-16"))
-        for message in velodyne_scans(
-            f"/sensing/lidar/{place}/velodyne_packets", model, "cdr", f"velodyne_{place}"
-        )
-    ]
-    messages.sort(key=lambda one: one.log_ns)
-    write_folder(Path("sample-rosbag"), [messages])
+    models = (("top", "VLS-128"), ("left", "VLP-16"), ("right", "VLP-16"))
+    folder(
+        "sample-rosbag",
+        *(
+            scans(f"/sensing/lidar/{place}/velodyne_packets", model, f"velodyne_{place}", ROS2)
+            for place, model in models
+        ),
+    )
     zero = "roll: 0.0, pitch: 0.0, yaw: 0.0"
-    quarter_rad = "roll: 0.0, pitch: 0.0, yaw: 1.5707963267948966"
     text(
         "sensors_calibration.yaml",
         f"base_link:\n  sensor_kit_base_link: {{x: 0.9, y: 0.0, z: 2.0, {zero}}}\n"
@@ -215,7 +378,8 @@ def autoware() -> None:
         "sensor_kit_calibration.yaml",
         "sensor_kit_base_link:\n"
         f"  camera0/camera_link: {{x: 0.1, y: 0.5, z: -0.3, {zero}}}\n"
-        f"  velodyne_top_base_link: {{x: 0.0, y: 0.0, z: 0.0, {quarter_rad}}}\n"
+        "  velodyne_top_base_link: {x: 0.0, y: 0.0, z: 0.0, roll: 0.0, pitch: 0.0, "
+        "yaw: 1.5707963267948966}\n"
         f"  velodyne_left_base_link: {{x: 0.0, y: 0.5, z: -0.3, {zero}}}\n"
         f"  velodyne_right_base_link: {{x: 0.0, y: -0.5, z: -0.3, {zero}}}\n",
     )
@@ -223,18 +387,22 @@ def autoware() -> None:
 
 def subt_mrs() -> None:
     """Raw packets of one VLP-16."""
-    bag("subt_mrs.bag", velodyne_scans("/velodyne_packets", "VLP-16", "ros1", "velodyne"))
+    bag("subt_mrs.bag", scans("/velodyne_packets", "VLP-16", "velodyne"))
 
 
-FORD = {"red": (1.0, 0.5, 1.5), "yellow": (1.2, 0.4, 1.5), "blue": (1.0, -0.5, 1.5),
-        "green": (1.2, -0.4, 1.5)}  # fmt: skip
+FORD = {
+    "red": (1.0, 0.5, 1.5),
+    "yellow": (1.2, 0.4, 1.5),
+    "blue": (1.0, -0.5, 1.5),
+    "green": (1.2, -0.4, 1.5),
+}
 
 
 def ford_av() -> None:
     """Four HDL-32E, a TransformStamped each."""
     bag(
         "2017-08-04-V2-Log1.bag",
-        *(velodyne_scans(f"/lidar_{c}_scan", "HDL-32E", "ros1", f"lidar_{c}") for c in FORD),
+        *(scans(f"/lidar_{c}_scan", "HDL-32E", f"lidar_{c}") for c in FORD),
     )
     for colour, (x, y, z) in FORD.items():
         text(
@@ -250,8 +418,10 @@ def utbm() -> None:
     """Two HDL-32E."""
     bag(
         "utbm_robocar_dataset_20180719.bag",
-        velodyne_scans("/hdl32e_left/velodyne_packets", "HDL-32E", "ros1", "velodyne_left"),
-        velodyne_scans("/hdl32e_right/velodyne_packets", "HDL-32E", "ros1", "velodyne_right"),
+        *(
+            scans(f"/hdl32e_{side}/velodyne_packets", "HDL-32E", f"velodyne_{side}")
+            for side in ("left", "right")
+        ),
     )
 
 
@@ -259,8 +429,10 @@ def ntu_viral() -> None:
     """Two OS1-16, header at the end of the sweep."""
     bag(
         "eee_01/eee_01.bag",
-        clouds("/os1_cloud_node1/points", OUSTER, after_start_ns, header_ns=LAST),
-        clouds("/os1_cloud_node2/points", OUSTER, after_start_ns, header_ns=LAST),
+        *(
+            clouds(f"/os1_cloud_node{n}/points", NTU, after_start_ns, header_ns=LAST)
+            for n in (1, 2)
+        ),
     )
     opencv("eee_01/lidar_horz.yaml", T_Body_Lidar=upright(-0.05, 0.0, 0.055))
     opencv("eee_01/lidar_vert.yaml", T_Body_Lidar=quarter(-0.55, 0.03, 0.05))
@@ -269,16 +441,15 @@ def ntu_viral() -> None:
 def mcd() -> None:
     """An Ouster, header at the end, and a Livox, header at the start; a bag each."""
     bag(
-        "ntu_day_01/ntu_day_01_os1.bag",
+        "ntu_day_01/ntu_day_01_os1_128.bag",
         clouds("/os_cloud_node/points", MCD, after_start_ns, header_ns=LAST),
     )
     bag("ntu_day_01/ntu_day_01_mid70.bag", customs("/livox/lidar"))
-    rows = {"os_sensor": quarter(0.0, 0.1, 0.2), "livox": upright(0.0, -0.1, 0.2)}
     lines = ["body:\n"]
-    for name, values in rows.items():
+    for name, values in (("os_sensor", quarter(0.0, 0.1, 0.2)), ("livox", upright(0.0, -0.1, 0.2))):
         lines.append(f"  {name}:\n    T:\n")
         lines += [f"    - {values[row * 4 : row * 4 + 4]}\n" for row in range(4)]
-    text("ntu_day_01/calibration.yaml", "".join(lines))
+    text("atv_calib.yaml", "".join(lines))
 
 
 def hilti_2021() -> None:
@@ -290,22 +461,36 @@ def hilti_2021() -> None:
     )
 
 
+def other(topic: str) -> Topic:
+    """A topic of another sensor."""
+    message = _make(ROS1, "std_msgs/msg/String", data="")
+    return topic, "std_msgs/msg/String", [(START_NS, message)]
+
+
+def hilti_2022(name: str = "exp14_basement_2.bag") -> None:
+    """A PandarXT-32 with times since 1970, and an IMU."""
+    pandar = clouds("/hesai/pandar", HESAI, since_1970_s, frame="PandarXT-32")
+    bag(name, pandar, other("/alphasense/imu"))
+
+
+def hilti_2023() -> None:
+    """The handheld of 2023."""
+    hilti_2022("site1_handheld_4.bag")
+
+
 def botanic_garden() -> None:
     """A VLP-16 and a Livox; matrices without a head, one of them twice."""
-    bag(
-        "1018_00.bag",
-        clouds("/velodyne_points", VELODYNE, before_end_s, header_ns=LAST),
-        customs("/livox/lidar"),
-    )
+    velodyne = clouds("/velodyne_points", VELODYNE, before_end_s, header_ns=LAST)
+    bag("1018_00.bag", velodyne, customs("/livox/lidar"), other("/imu/data"))
     opencv(
         "calib_chain.yaml",
+        head="# VLP16 in Xsens coordinates\n",
         T_xsens_vlp16=quarter(0.06, 0.01, 0.17),
         T_vlp16_livox=upright(0.08, -0.01, -0.18),
     )
     path = Path("calib_chain.yaml")
-    matrix = path.read_text().split("---\n")[1]
     twice = "T_xsens_rgb0: !!opencv-matrix {rows: 1, cols: 1, dt: d, data: [1]}\n" * 2
-    path.write_text(f"# VLP16 in Xsens coordinates\n{matrix}{twice}")
+    path.write_text(path.read_text() + twice)
 
 
 def m3dgr() -> None:
@@ -313,16 +498,38 @@ def m3dgr() -> None:
     bag("Outdoor01.bag", customs("/livox/avia/lidar"), customs("/livox/mid360/lidar"))
 
 
+# Rounded to four digits, as in cali/alpha_config.yaml.
+ALPHA = [
+    0.9999,
+    0.0049,
+    0.0153,
+    0.0961,
+    -0.0050,
+    1.0000,
+    0.0021,
+    -0.1338,
+    -0.0153,
+    -0.0022,
+    0.9999,
+    0.3032,
+    0.0,
+    0.0,
+    0.0,
+    1.0,
+]
+
+
 def geode() -> None:
     """A bag a device, each with a lidar; a calibration whose keys come twice, without a head."""
-    opencv("cali/alpha_config.yaml", T_IMU_LiDAR=upright(0.0961, -0.1338, 0.3032))
-    path = Path("cali/alpha_config.yaml")
-    matrix = path.read_text().split("---\n")[1]
     camera = (
         'image_topic: "/imu/imu"\nmodel_type:   PINHOLE\ndistortion_parameters:\n   k1: -0.05\n'
     )
     noise = "gyro_std: 9.6690835928856730e-03\ngyro_std: 8.2887875865635737e-05\n"
-    path.write_text(f"# Left camera\n{camera}# Right camera\n{camera}{noise}{matrix}")
+    opencv(
+        "cali/alpha_config.yaml",
+        head=f"# Left\n{camera}# Right\n{camera}{noise}",
+        T_IMU_LiDAR=ALPHA,
+    )
     bag("Urban_alpha.bag", clouds("/velodyne_points", VELODYNE, before_end_s, header_ns=LAST))
     bag("Urban_beta.bag", clouds("/ouster/points", OUSTER, after_start_ns))
 
@@ -330,23 +537,20 @@ def geode() -> None:
 def grand_tour() -> None:
     """A bag a topic; transforms in another one; frames of the clouds' headers."""
     stem = "mission/2024-10-01-11-29-55"
-    bag(
-        f"{stem}_hesai.bag",
-        clouds("/boxi/hesai/points", HESAI, since_1970_s, frame="hesai_lidar"),
-    )
+    bag(f"{stem}_hesai.bag", clouds("/boxi/hesai/points", HESAI, since_1970_s, frame="hesai_lidar"))
     bag(
         f"{stem}_livox.bag",
         clouds("/boxi/livox/points", LIVOX2, since_1970_ns, frame="livox_lidar"),
     )
-    edges = [
-        ("base", "box_base", (0.0, 0.0, 0.5), (0.0, 0.0, 0.0, 1.0)),
-        ("box_base", "hesai_lidar", (0.1, 0.0, 0.3), (0.0, 0.0, H, H)),
-        ("box_base", "livox_lidar", (0.2, 0.0, 0.1), (0.0, 0.0, 0.0, 1.0)),
-    ]
-    message = transforms_message("ros1", edges)
     bag(
         f"{stem}_tf_minimal.bag",
-        [Recorded("/tf_static", "tf2_msgs/TFMessage", START_NS, message, latched=True)],
+        transforms(
+            [
+                ("base", "box_base", (0.0, 0.0, 0.5), (0.0, 0.0, 0.0, 1.0)),
+                ("box_base", "hesai_lidar", (0.1, 0.0, 0.3), (0.0, 0.0, H, H)),
+                ("box_base", "livox_lidar", (0.2, 0.0, 0.1), (0.0, 0.0, 0.0, 1.0)),
+            ]
+        ),
     )
 
 
@@ -369,100 +573,184 @@ def tiers() -> None:
 
 def urban_nav() -> None:
     """An HDL-32E, a VLP-16 and an LSLIDAR; a file with a mistake elsewhere."""
+    topics = ("/velodyne_points", "/left/lslidar_point_cloud", "/right/velodyne_points")
     bag(
         "UrbanNav-HK_TST-20210517_sensors.bag",
-        *(
-            clouds(topic, VELODYNE, before_end_s, header_ns=LAST)
-            for topic in ("/velodyne_points", "/left/lslidar_point_cloud", "/right/velodyne_points")
-        ),
+        *(clouds(topic, VELODYNE, before_end_s, header_ns=LAST) for topic in topics),
     )
+    camera = "LEFT_CAMERA_T_IMU:!!opencv-matrix (Left camera to IMU)\n rows: 4\n   cols: 4\n"
     opencv(
         "extrinsic.yaml",
+        head=f"%YAML:1.0\n\n{camera}",
         CENTER_LiDAR_T_IMU=upright(0.0, 0.0, 0.28),
         LEFT_LiDAR_T_CENTER_LiDAR=quarter(-0.27, 0.0, -0.22),
         RIGHT_LiDAR_T_CENTER_LiDAR=upright(0.32, 0.0, -0.2),
     )
-    path = Path("extrinsic.yaml")
-    matrices = path.read_text().split("---\n")[1]
-    camera = "LEFT_CAMERA_T_IMU:!!opencv-matrix (Left camera to IMU)\n rows: 4\n   cols: 4\n"
-    path.write_text(f"%YAML:1.0\n\n{camera}{matrices}")
 
 
 HELIPR = {
-    "Ouster": ({"x": "f4", "y": "f4", "z": "f4", "intensity": "f4", "t": "u4",
-                "reflectivity": "u2", "ring": "u2", "ambient": "u2"}, after_start_ns),
-    "Velodyne": ({"x": "f4", "y": "f4", "z": "f4", "intensity": "f4", "ring": "u2",
-                  "time": "f4"}, after_start_s),
-    "Avia": ({"x": "f4", "y": "f4", "z": "f4", "reflectivity": "u1", "tag": "u1", "line": "u1",
-              "offset_time": "u4"}, after_start_ns),
-    "Aeva": ({"x": "f4", "y": "f4", "z": "f4", "reflectivity": "f4", "velocity": "f4",
-              "time_offset_ns": "i4", "line_index": "u1", "intensity": "f4"}, after_start_ns),
-}  # fmt: skip
+    "Ouster": (OUSTER, after_start_ns),
+    "Velodyne": (VELODYNE, after_start_s),
+    "Avia": (
+        {
+            "x": "f4",
+            "y": "f4",
+            "z": "f4",
+            "reflectivity": "u1",
+            "tag": "u1",
+            "line": "u1",
+            "offset_time": "u4",
+        },
+        after_start_ns,
+    ),
+    "Aeva": (
+        {
+            "x": "f4",
+            "y": "f4",
+            "z": "f4",
+            "reflectivity": "f4",
+            "velocity": "f4",
+            "time_offset_ns": "i4",
+            "line_index": "u1",
+            "intensity": "f4",
+        },
+        after_start_ns,
+    ),
+}
+
+
+def _helipr(name: str) -> None:
+    data = rows(*HELIPR[name]).tobytes()
+    files(f"Roundabout01/LiDAR/{name}", lambda start: f"{start}.bin", lambda _: data)
 
 
 def helipr() -> None:
     """A folder of raw points for each lidar."""
-    for name, (fields, time) in HELIPR.items():
-        points = _points(list(fields), time, 0)
-        data = raw(fields, points)
-        names = {f"{START_NS + number * SWEEP}.bin": data for number in range(SWEEPS)}
-        write_sweeps(Path("Roundabout01/LiDAR") / name, names)
+    for name in HELIPR:
+        _helipr(name)
+
+
+VIEWS = ("frontcenter", "frontleft", "frontright", "sideleft", "sideright", "rearcenter")
 
 
 def a2d2() -> None:
-    """Points of the views of two cameras as numpy arrays, us since 1970."""
-    for view in ("front_center", "front_left"):
-        folder = Path("camera_lidar") / f"cam_{view}"
-        folder.mkdir(parents=True, exist_ok=True)
-        for number in range(SWEEPS):
-            start_us = (START_NS + number * SWEEP) // 1000
+    """Points of the views of the cameras as numpy arrays, us since 1970."""
+    for view in VIEWS:
+        place = Path("camera_lidar/20180810_150607/lidar") / f"cam_{view}"
+        place.mkdir(parents=True, exist_ok=True)
+        for number, start in enumerate(starts(), 60):
             column = np.repeat(np.arange(COLUMNS), RINGS)
-            xyz = np.zeros((len(column), 3))
-            xyz[:, 0] = 1.0
             arrays: dict[str, Any] = {
-                "pcloud_points": xyz,
-                "pcloud_attr.timestamp": start_us + column * 1000,
+                "pcloud_points": np.tile((1.0, 0.0, 0.0), (len(column), 1)),
+                "pcloud_attr.timestamp": since_1970_us(column, start),
                 "pcloud_attr.reflectance": np.full(len(column), 9),
                 "pcloud_attr.lidar_id": np.tile(np.arange(RINGS) % 2, COLUMNS),
             }
-            np.savez(folder / f"20180810150607_lidar_{view}_{number:09d}.npz", **arrays)
+            np.savez(place / f"20180810150607_lidar_{view}_{number:09d}.npz", **arrays)
 
 
-XYZ_ONLY = {"x": "f4", "y": "f4", "z": "f4", "intensity": "f4"}
+def boreas() -> None:
+    """Six float32 a point; the name is the middle of the scan in us, times count from it."""
+    fields = {"x": "f4", "y": "f4", "z": "f4", "intensity": "f4", "ring": "f4", "t": "f4"}
+    data = rows(fields, lambda column, _: (column - 50) / 1000).tobytes()
+    text("boreas-2021-09-02-11-42/applanix/lidar_poses.csv", "GPSTime,easting,northing\n")
+    files(
+        "boreas-2021-09-02-11-42/lidar",
+        lambda start: f"{(start + 50 * MS) // 1000}.bin",
+        lambda _: data,
+    )
+
+
+TRUCK = (
+    "LIDAR_LEFT",
+    "LIDAR_RIGHT",
+    "LIDAR_TOP_FRONT",
+    "LIDAR_TOP_LEFT",
+    "LIDAR_TOP_RIGHT",
+    "LIDAR_REAR",
+)
+
+
+def _truck(name: str) -> None:
+    files(
+        f"man-truckscenes/sweeps/{name}",
+        lambda start: f"{name}_{start // 1000}.pcd",
+        lambda start: pcd(rows({**XYZI, "timestamp": "u8"}, since_1970_us, start)),
+    )
+
+
+def truckscenes() -> None:
+    """PCD with a uint64 time in us since 1970."""
+    for name in TRUCK:
+        _truck(name)
+
+
+def zenseact() -> None:
+    """A structured .npy; int64 us from the core time in the name, here the middle."""
+    place = Path("sequences/000000/lidar_velodyne")
+    place.mkdir(parents=True, exist_ok=True)
+    fields = {
+        "x": "f4",
+        "y": "f4",
+        "z": "f4",
+        "timestamp": "i8",
+        "intensity": "u1",
+        "diode_index": "u1",
+    }
+    for start in starts():
+        middle = datetime.fromtimestamp((start + 50 * MS) / 1e9, timezone.utc)
+        name = middle.strftime("000000_india_%Y-%m-%dT%H:%M:%S.%fZ.npy")
+        np.save(place / name, rows(fields, lambda column, _: (column - 50) * 1000))
+
+
+def nuscenes() -> None:
+    """Five float32 a point, no time."""
+    data = np.tile(np.array([1, 0, 0, 9, 1], "<f4"), 100).tobytes()
+    files(
+        "nuscenes/sweeps/LIDAR_TOP",
+        lambda start: f"n015-2018-07-24-11-22-45+0800__LIDAR_TOP__{start // 1000}.pcd.bin",
+        lambda _: data,
+    )
 
 
 def complex_urban() -> None:
     """Raw points without times."""
-    data = raw(XYZ_ONLY, [(1.0, 0.0, 0.0, 9.0)] * 100)
-    names = {f"{START_NS + number * SWEEP}.bin": data for number in range(SWEEPS)}
-    write_sweeps(Path("urban08/sensor_data/VLP_left"), names)
+    data = np.tile(np.array([1, 0, 0, 9], "<f4"), 100).tobytes()
+    for side in ("left", "right"):
+        files(f"urban08/sensor_data/VLP_{side}", lambda start: f"{start}.bin", lambda _: data)
 
 
 def nuplan() -> None:
     """PCD files of merged lidars, without times."""
-    fields = {**XYZ_ONLY, "ring": "f4", "lidar_info": "f4"}
-    data = pcd(fields, [(1.0, 0.0, 0.0, 9.0, 1.0, 2.0)] * 100)
-    names = {f"{START_NS // 1000 + number * 50_000}.pcd": data for number in range(SWEEPS)}
-    write_sweeps(Path("sensor_blobs/MergedPointCloud"), names)
+    data = pcd(rows({**XYZI, "ring": "f4", "lidar_info": "f4"}, after_start_s))
+    files(
+        "sensor_blobs/MergedPointCloud", lambda start: f"{start // 1000:016x}.pcd", lambda _: data
+    )
 
 
 def lyft() -> None:
     """Raw points without times."""
-    data = raw({**XYZ_ONLY, "ring": "f4"}, [(1.0, 0.0, 0.0, 9.0, 1.0)] * 100)
-    names = {f"{START_NS // 1000 + number * 100_000}.bin": data for number in range(SWEEPS)}
-    write_sweeps(Path("v1.01-train/lidar"), names)
+    data = np.tile(np.array([1, 0, 0, 9, 1], "<f4"), 100).tobytes()
+    files(
+        "v1.01-train/lidar", lambda start: f"host-a007_lidar1_{start // 1000}.bin", lambda _: data
+    )
 
 
 def waymo() -> None:
     """Range images in TFRecords."""
-    write_sweeps(Path("waymo"), {"segment-10017090168044687777.tfrecord": bytes(100)})
+    files("waymo", lambda start: f"segment-{start}.tfrecord", lambda _: bytes(100))
 
 
 def argoverse2() -> None:
     """Tables of Arrow."""
-    write_sweeps(Path("sensors/lidar"), {"315967376959822000.feather": b"ARROW1\0\0" + bytes(99)})
+    files("sensors/lidar", lambda start: f"{start}.feather", lambda _: b"ARROW1\0\0" + bytes(99))
 
 
 def pandaset() -> None:
     """Pickles."""
-    write_sweeps(Path("001/lidar"), {"00.pkl.gz": gzip.compress(b"\x80\x04]\x94.")})
+    text("001/meta/timestamps.json", json.dumps([start / 1e9 for start in starts()]))
+    files(
+        "001/lidar",
+        lambda start: f"{(start - START_NS) // SWEEP:02d}.pkl.gz",
+        lambda _: gzip.compress(b"\x80\x04]\x94."),
+    )

@@ -18,7 +18,7 @@ OPTIONS: dict[str, set[str]] = {
     command: {f"--{name}" for name in names.split()}
     for command, names in {
         "convert": """
-            output rig rate format layout sort deskew deskew-to stamp batching
+            output rig dataset rate format layout sort deskew deskew-to stamp batching
             batching-times point-layout ply-style max-bag-duration slices split keep-partial
             max-wait
             start end clock align-clocks align-to on-jump min-range max-range exclude-box
@@ -30,14 +30,15 @@ OPTIONS: dict[str, set[str]] = {
         """,
         "merge": "output fail-on overwrite no-fsync quiet",
         "batch": """
-            output rig workers jobs retries part only plan fail-fast retry-failed no-pages
+            output rig dataset workers jobs retries part only plan fail-fast retry-failed no-pages
             scheduler cache quiet time-limit disk-limit list
         """,
         "batch-status": "json page",
-        "inspect": "rig whole verbose metadata json write-rig",
+        "inspect": "rig dataset whole verbose metadata json write-rig",
         "compare": """rig rate metadata clock tolerance timeout html figures speed overwrite verbose
             json""",
         "sensors": "json",
+        "datasets": "json",
         "verify": "report json verbose",
         "report": "output report html-scans overwrite",
         "view": """

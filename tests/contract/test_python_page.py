@@ -45,6 +45,7 @@ def test_options_have_the_names_of_the_command() -> None:
 # By the columns of the page: an option of Python, and a value of it that is not the usual one.
 SESSION = {
     "rig": FIXTURE / "rig.yaml",
+    "dataset": None,
     "metadata": [FIXTURE / "left.json"],
     "only": "by serial number",
     "ignore": "by serial number",

@@ -19,6 +19,7 @@ SENSORS = "sensors: [{name: a}]\n"
 NOT_IN_A_RIG = {
     *(
         "--rig",
+        "--dataset",
         "--output",
         "--report",
         "--html",

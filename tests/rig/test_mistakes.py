@@ -73,9 +73,9 @@ FIX = "correct it or remove the key"
 MISTAKES: list[tuple[str, str]] = [
     # The form of the file.
     ("", "1: expected a mapping with keys of body_frame, rate_hz, sensors, exclude_boxes_m, "
-         "convert, found nothing; write `key: value`"),
+         "convert, dataset, found nothing; write `key: value`"),
     ("- name: left\n", "1: expected a mapping with keys of body_frame, rate_hz, sensors, "
-                       "exclude_boxes_m, convert, found a list of 1; write `key: value`"),
+                       "exclude_boxes_m, convert, dataset, found a list of 1; write `key: value`"),
     ("rate_hz: 10\n", "1: expected the key sensors, found none; add it"),
     ("sensors:\n  - name: a\n - name: b\n",
      "3: expected YAML, found a mistake (expected <block end>, but found '<block sequence "
@@ -106,7 +106,7 @@ MISTAKES: list[tuple[str, str]] = [
      f"3: {S}.modle: expected a key of {SENSOR_KEYS}, found 'modle'; the nearest known key is "
      "model"),
     ("rate: 10\nsensors: [{name: a}]\n",
-     "1: rate: expected a key of body_frame, rate_hz, sensors, exclude_boxes_m, convert, "
+     "1: rate: expected a key of body_frame, rate_hz, sensors, exclude_boxes_m, convert, dataset, "
      "found 'rate'; the nearest known key is rate_hz"),
     (one("extrinsics: {rotation_rpy: [0, 0, 0]}"),
      f"3: {X}.rotation_rpy: expected a key of {X_KEYS}, found 'rotation_rpy'; "
@@ -165,16 +165,16 @@ MISTAKES: list[tuple[str, str]] = [
      f"found 'base-link'; {FIX}"),
     # Clouds.
     (one("stream: {topic: /a}\n    points: {tme: t}"),
-     f"4: {S}.points.tme: expected a key of time, unit, from, ring, glob, dtype, found 'tme'; "
-     "the nearest known key is time"),
+     f"4: {S}.points.tme: expected a key of time, unit, from, ring, glob, dtype, arrays, "
+     "found 'tme'; the nearest known key is time"),
     (one("stream: {topic: /a}\n    points:\n      unit: min"),
      f"5: {S}.points.unit: expected s or ms or us or ns, found 'min'; use one of these words"),
     (one("stream: {topic: /a}\n    points: {from: middle}"),
      f"4: {S}.points.from: expected start or end or back or absolute, found "
      "'middle'; use one of these words"),
     (one("stream: {topic: /a}\n    points: {}"),
-     f"4: {S}.points: expected at least one of time, unit, from, ring, glob, dtype, found none; "
-     "add one of them"),
+     f"4: {S}.points: expected at least one of time, unit, from, ring, glob, dtype, arrays, "
+     "found none; add one of them"),
     (one("points: {unit: us}"),
      f"3: {S}.points: expected a sensor on a topic, found none; "
      "give the topic of its clouds as stream: {topic: ...}, files of sweeps as glob, or "

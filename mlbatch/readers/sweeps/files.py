@@ -1,4 +1,4 @@
-"""Files of one sweep, as PointCloud2 messages: points of a numpy dtype, or PCD.
+"""Files of one sweep, as PointCloud2 messages: points of a numpy dtype, numpy arrays, or PCD.
 
 PCD: PCL, "The PCD (Point Cloud Data) file format", version 0.7. PointField:
 docs/sources/messages.md section 8.
@@ -10,14 +10,18 @@ import errno
 import io
 import re
 import struct
-from collections.abc import Sequence
+import zipfile
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from mlbatch.bounded import read_bytes
 from mlbatch.rig.rig import Sweeps
+from mlbatch.ros.point_times import TIME_NAMES, PointRule
 from mlbatch.units import NS_PER_S
 
 _PCD_HEADS = (b"# .PCD", b"VERSION", b"#.PCD", b"FIELDS")
@@ -30,6 +34,8 @@ _DIGITS = re.compile(r"\d{1,12}", re.ASCII)
 _NUMBERS = {"i1": 1, "u1": 2, "i2": 3, "u2": 4, "i4": 5, "u4": 6, "f4": 7, "f8": 8}
 # Whole numbers of 64 bits, as times since 1970; a PointField has none, so they become float64.
 _WIDE = ("i8", "u8")
+_NPY_HEAD = b"\x93NUMPY"
+_ZIP_HEAD = b"PK\x03\x04"
 MOST_BYTES = 1 << 28
 
 
@@ -48,6 +54,34 @@ class _Points:
 
 def read_sweep(path: Path, sweeps: Sweeps, stamp_ns: int) -> bytes:
     """Return a PointCloud2 in ROS 1 serialisation with the points of a file."""
+    return _message(_points(path, sweeps), stamp_ns)
+
+
+def first_ns(path: Path, sweeps: Sweeps, rule: PointRule) -> int:
+    """The earliest time of the points of a file, which count from 1970 in the unit of the rule."""
+    points = _points(path, sweeps)
+    known = {name: (f"<{kind}", offset) for name, kind, offset in points.fields}
+    name = rule.time or next((name for name in TIME_NAMES if name in known), "")
+    if name not in known or not rule.unit_ns:
+        raise SweepError(
+            f"{path}: expected the time of the sweep as its name, or points with times from 1970 "
+            f"as `time` and `unit`, found fields {', '.join(known)} and unit "
+            f"{rule.keys()['unit'] or 'none'}; give both in the rig"
+        )
+    kind, offset = known[name]
+    layout = np.dtype(
+        {"names": [name], "formats": [kind], "offsets": [offset], "itemsize": points.step}
+    )
+    times: _Array = np.frombuffer(points.data, layout)[name]
+    if not len(times):
+        raise SweepError(f"{path}: expected points, found none; remove it")
+    # In two parts: a float64 of ns since 1970 has a step of 256.
+    whole, part = divmod(float(times.min()), 1)
+    return int(whole) * rule.unit_ns + round(part * rule.unit_ns)
+
+
+def _points(path: Path, sweeps: Sweeps) -> _Points:
+    """The points of a file in any of the formats."""
     try:
         data = read_bytes(path, MOST_BYTES)
     except OSError as err:
@@ -62,29 +96,35 @@ def read_sweep(path: Path, sweeps: Sweeps, stamp_ns: int) -> bytes:
         ) from err
     if not data:
         raise SweepError(f"{path}: expected points, found 0 bytes; remove it or copy it again")
+    if data.startswith((_NPY_HEAD, _ZIP_HEAD)):
+        return _of_columns(path, _columns(path, data, sweeps))
     is_pcd = data.startswith(_PCD_HEADS)
-    if is_pcd and sweeps.fields:
+    if is_pcd and (sweeps.fields or sweeps.arrays):
         raise SweepError(
-            f"{path}: expected points of the dtype, found a PCD file; remove `dtype`, as PCD "
-            "states its fields"
+            f"{path}: expected points of the dtype, found a PCD file; remove `dtype` and `arrays`, "
+            "as PCD states its fields"
         )
     if not is_pcd and not sweeps.fields:
         raise SweepError(
             f"{path}: expected a PCD file, found one that begins with {data[:8].hex(' ')}; give "
             "the fields as `dtype`, or correct `glob`"
         )
-    points = _pcd(path, data) if is_pcd else _raw(path, data, sweeps)
-    return _message(points, stamp_ns)
+    return _pcd(path, data) if is_pcd else _raw(path, data, sweeps)
 
 
 def _raw(path: Path, data: bytes, sweeps: Sweeps) -> _Points:
-    fields, step = _offsets(sweeps.fields)
+    step = sum(int(kind[1:]) for _, kind in sweeps.fields)
     if len(data) % step:
         raise SweepError(
             f"{path}: expected a multiple of {step} bytes, the size of a point of the dtype, found "
             f"{len(data)}; correct `dtype`, or copy the file again"
         )
-    return _Points(fields, step, data)
+    return _Points(*_offsets(_narrow(sweeps.fields)), _as_floats(data, sweeps.fields))
+
+
+def _narrow(fields: Sequence[tuple[str, str]]) -> list[tuple[str, str]]:
+    """Fields with float64 for whole numbers of 64 bits."""
+    return [(name, "f8" if kind in _WIDE else kind) for name, kind in fields]
 
 
 def _offsets(
@@ -99,6 +139,98 @@ def _offsets(
         # The bytes of a type are its last digits: f4, V12.
         offset += int(kind[1:])
     return tuple(found), offset
+
+
+# -- numpy arrays ---------------------------------------------------------------------------------
+
+_Array = npt.NDArray[Any]
+
+
+def _columns(path: Path, data: bytes, sweeps: Sweeps) -> Mapping[str, _Array]:
+    """An array for each field of the points of a .npy or .npz file."""
+    arrays = _arrays(path, data)
+    if "" not in arrays:
+        named = dict(sweeps.arrays) or {name: name for name in arrays}
+        return {field: _column(path, arrays, name) for field, name in named.items()}
+    array = arrays[""]
+    if array.dtype.names and not sweeps.fields:
+        return {name: array[name] for name in array.dtype.names}
+    kinds = [kind for _, kind in sweeps.fields]
+    if array.ndim != 2 or any(
+        array.dtype.newbyteorder("<") != kind for kind in kinds if kind[0] != "V"
+    ):
+        kinds = []
+    if not kinds or len(kinds) != array.shape[1]:
+        given = "none" if not sweeps.fields else f"{len(sweeps.fields)} fields in the rig"
+        raise SweepError(
+            f"{path}: expected an array with named fields and no `dtype`, or of n rows of one type "
+            f"and its columns as `dtype`, found {_shown(array)} and {given}; correct `dtype`"
+        )
+    return {name: array[:, at] for at, (name, kind) in enumerate(sweeps.fields) if kind[0] != "V"}
+
+
+def _arrays(path: Path, data: bytes) -> Mapping[str, _Array]:
+    """Arrays of a .npz file by name, or that of a .npy file as ""; pickles are not read."""
+    try:
+        if data.startswith(_NPY_HEAD):
+            return {"": np.load(io.BytesIO(data), allow_pickle=False)}
+        with zipfile.ZipFile(io.BytesIO(data)) as archive:
+            size = sum(member.file_size for member in archive.infolist())
+        if size > MOST_BYTES:
+            raise ValueError(f"{size} bytes of arrays, more than {MOST_BYTES}")
+        with np.load(io.BytesIO(data), allow_pickle=False) as file:
+            return dict(file)
+    except Exception as err:
+        # Damaged headers and archives end in errors of many kinds.
+        reason = (str(err).splitlines() or [type(err).__name__])[0]
+        raise SweepError(
+            f"{path}: expected arrays of numbers, found others ({reason}); copy the file again"
+        ) from err
+
+
+def _column(path: Path, arrays: Mapping[str, _Array], name: str) -> _Array:
+    """An array with one number for each point, or a column of one with several: points.0."""
+    table, _, column = name.rpartition(".")
+    array = arrays.get(name)
+    if array is None and _DIGITS.fullmatch(column) and table in arrays:
+        rows = arrays[table]
+        array = rows[:, int(column)] if rows.ndim == 2 and int(column) < rows.shape[1] else rows
+    if array is None or array.ndim != 1:
+        known = ", ".join(f"{key} {_shown(one)}" for key, one in arrays.items())
+        raise SweepError(
+            f"{path}: expected one number for each point as array {name}, found {known}; give the "
+            "arrays of the fields in the rig (points: {arrays: {x: points.0, y: points.1}})"
+        )
+    return array
+
+
+def _of_columns(path: Path, columns: Mapping[str, _Array]) -> _Points:
+    fields = {name: _kind(column) for name, column in columns.items()}
+    sizes = {len(column) for column in columns.values()}
+    lacking = [name for name, kind in fields.items() if not kind]
+    if lacking or len(sizes) != 1:
+        shown = ", ".join(f"{name} {_shown(column)}" for name, column in columns.items())
+        raise SweepError(
+            f"{path}: expected one number for each point in each field, found {shown}; correct "
+            "`arrays`, or leave a field out"
+        )
+    rows = np.zeros(sizes.pop(), [(name, f"<{kind}") for name, kind in fields.items()])
+    for name, column in columns.items():
+        rows[name] = column
+    return _Points(*_offsets(list(fields.items())), rows.tobytes())
+
+
+def _kind(column: _Array) -> str:
+    """Type of a PointField that holds the numbers of an array; "" for others."""
+    kind, size = column.dtype.kind, column.dtype.itemsize
+    if column.ndim != 1 or kind not in "iufb":
+        return ""
+    text = {"b": "u1", "f": "f4" if size <= 4 else "f8"}.get(kind, f"{kind}{size}")
+    return "f8" if text in _WIDE else text
+
+
+def _shown(array: _Array) -> str:
+    return f"({', '.join(map(str, array.shape))}) {array.dtype}"
 
 
 # -- PCD ------------------------------------------------------------------------------------------
@@ -126,7 +258,7 @@ def _pcd(path: Path, data: bytes) -> _Points:
         single = text in (*_NUMBERS, *_WIDE) and repeated == "1" and name != "_"
         fields.append((name, text if single else f"V{int(size) * int(repeated)}"))
     count = _count(path, head)
-    found, step = _offsets([(name, "f8" if kind in _WIDE else kind) for name, kind in fields])
+    found, step = _offsets(_narrow(fields))
     kind = head["DATA"].split()[0] if head["DATA"].split() else ""
     if kind == "ascii":
         return _Points(found, step, _as_floats(_ascii(path, body, fields, count), fields))
@@ -151,10 +283,7 @@ def _as_floats(data: bytes, fields: Sequence[tuple[str, str]]) -> bytes:
         np.dtype(
             [(f"{at}", f"<{kind}" if kind[0] != "V" else kind) for at, kind in enumerate(kinds)]
         )
-        for kinds in (
-            [kind for _, kind in fields],
-            ["f8" if kind in _WIDE else kind for _, kind in fields],
-        )
+        for kinds in ([kind for _, kind in part] for part in (fields, _narrow(fields)))
     )
     return np.frombuffer(data, before).astype(after).tobytes()
 

@@ -9,13 +9,15 @@ from __future__ import annotations
 import re
 from collections.abc import Generator, Sequence
 from dataclasses import dataclass
+from datetime import datetime
 from pathlib import Path
 
 import numpy as np
 
 from mlbatch.errors import RecordingError
-from mlbatch.readers.sweeps.files import SweepError, read_sweep
+from mlbatch.readers.sweeps.files import SweepError, first_ns, read_sweep
 from mlbatch.rig.rig import RigSensor, Sweeps
+from mlbatch.ros.point_times import ABSOLUTE, CONVENTION, UNITS_NS, PointRule
 from mlbatch.types import CaptureCounts, Message, PacketBatch, Recording, Topic
 from mlbatch.units import NS_PER_MS, NS_PER_S, NS_PER_US
 
@@ -25,6 +27,8 @@ _UNITS_NS = {10: NS_PER_S, 13: NS_PER_MS, 16: NS_PER_US, 19: 1}
 # Seconds with decimals are exact to the nanosecond.
 _SECONDS = re.compile(r"(\d{10})[._](\d{1,9})", re.ASCII)
 _WHOLE = re.compile(r"\d+", re.ASCII)
+_ISO = r"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d(?:\.\d{1,9})?Z"
+_STAMP = re.compile(r"\{stamp(?::(\w+))?\}")
 _LATEST_NS = 2**31 * NS_PER_S
 # A batch ends with the file that exceeds this.
 _BATCH_BYTES = 8 << 20
@@ -57,7 +61,8 @@ class SweepRecording(Recording):
         found: list[_SweepFile] = []
         topics: list[Topic] = []
         for sensor in sensors:
-            files = [] if sensor.sweeps is None else _files(folder, sensor.sweeps)
+            rule = sensor.points or CONVENTION
+            files = [] if sensor.sweeps is None else _files(folder, sensor.sweeps, rule)
             if files:
                 topics.append(files[0].topic)
                 found += files
@@ -112,18 +117,29 @@ def _batch(messages: list[Message]) -> PacketBatch:
     return PacketBatch(np.zeros(0, np.uint8), _NONE, _NONE, _NONE, _NONE, tuple(messages))
 
 
-def _files(folder: Path, sweeps: Sweeps) -> list[_SweepFile]:
+def sweep_paths(folder: Path, glob: str) -> list[Path]:
+    """The files of a pattern in a folder, by name."""
+    return sorted(path for path in folder.glob(_STAMP.sub("*", glob)) if path.is_file())
+
+
+def _files(folder: Path, sweeps: Sweeps, rule: PointRule) -> list[_SweepFile]:
     """The files of a sensor in the order of their times; RecordingError where these are unclear."""
-    paths = sorted(path for path in folder.glob(sweeps.glob) if path.is_file())
     topic = Topic(sweeps.glob, CLOUD_TYPE, "ros1")
     found: dict[int, _SweepFile] = {}
-    unit_ns = 0
-    for path in paths:
-        stamp_ns, own_unit_ns = _stamp_ns(path, sweeps)
+    name = _name_pattern(sweeps.glob)
+    unit_ns = stamp_ns = 0
+    for path in sweep_paths(folder, sweeps.glob):
+        own_unit_ns = 1
+        if "{stamp" not in sweeps.glob and rule.origin == ABSOLUTE and not _is_time(path.stem):
+            # What is not read is counted when its turn comes.
+            stamp_ns = _first_ns(path, sweeps, rule) or stamp_ns + 1
+        else:
+            text = path.relative_to(folder).as_posix()
+            stamp_ns, own_unit_ns = _stamp_ns(text, name, path, sweeps)
         if unit_ns not in (0, own_unit_ns):
             raise RecordingError(
-                f"{path}: expected a time with the digits of {paths[0].name}, found another "
-                f"unit; correct the pattern {sweeps.glob} ({sweeps.place})"
+                f"{path}: expected a time with the digits of {next(iter(found.values())).path.name}"
+                f", found another unit; correct the pattern {sweeps.glob} ({sweeps.place})"
             )
         unit_ns = own_unit_ns
         other = found.get(stamp_ns)
@@ -159,17 +175,60 @@ def _fault(file: _SweepFile) -> str:
     return ""
 
 
-def _stamp_ns(path: Path, sweeps: Sweeps) -> tuple[int, int]:
+def _first_ns(path: Path, sweeps: Sweeps, rule: PointRule) -> int:
+    """The first time of the points of a file; 0 where it cannot be read."""
+    try:
+        return first_ns(path, sweeps, rule)
+    except SweepError as err:
+        if not rule.unit_ns:
+            raise RecordingError(f"{err} ({sweeps.place})") from err
+        return 0
+
+
+def _name_pattern(glob: str) -> re.Pattern[str] | None:
+    """Names of files that a pattern describes, with the time as a group; None: it is the stem."""
+    if "{stamp" not in glob:
+        return None
+    parts = re.split(r"(\{stamp[^}]*\}|\*\*/|\*|\?|\[[^]]*\])", glob)
+    words = {"**/": "(?:.*/)?", "*": "[^/]*?", "?": "[^/]"}
+    return re.compile(
+        "".join(
+            rf"(?<!\d)(?P<stamp>{_ISO}|\d{{10}}[._]\d{{1,9}}|\d+)"
+            if part.startswith("{")
+            else words.get(part, part.replace("[!", "[^") if part[:1] == "[" else re.escape(part))
+            for part in parts
+        ),
+        re.DOTALL,
+    )
+
+
+def _is_time(text: str) -> bool:
+    is_whole = _WHOLE.fullmatch(text) is not None and len(text) in _UNITS_NS
+    return is_whole or _SECONDS.fullmatch(text) is not None
+
+
+def _stamp_ns(
+    name: str, pattern: re.Pattern[str] | None, path: Path, sweeps: Sweeps
+) -> tuple[int, int]:
     """The time in the name of a file, and the unit of its digits, ns."""
     text = path.stem
+    if pattern is not None and (found := pattern.fullmatch(name)):
+        text = found["stamp"]
+    given = _STAMP.search(sweeps.glob)
+    unit = given[1] if given else None
+    if unit == "iso" and re.fullmatch(_ISO, text):
+        whole_s = round(datetime.fromisoformat(f"{text[:19]}+00:00").timestamp())
+        text, unit = f"{whole_s}.{text[20:-1] or 0}", "s"
     seconds = _SECONDS.fullmatch(text)
-    if seconds:
+    if seconds and unit in ("s", None):
         whole, decimals = seconds.groups()
         stamp_ns = int(whole) * NS_PER_S + int(decimals.ljust(9, "0"))
         unit_ns = NS_PER_S
     else:
         is_whole = _WHOLE.fullmatch(text) is not None
-        unit_ns = _UNITS_NS.get(len(text), 0) if is_whole else 0
+        unit_ns = (
+            (UNITS_NS.get(unit, 0) if unit else _UNITS_NS.get(len(text), 0)) if is_whole else 0
+        )
         stamp_ns = int(text) * unit_ns if unit_ns else 0
     if not 0 < stamp_ns < _LATEST_NS:
         raise RecordingError(

@@ -1,0 +1,47 @@
+"""`mlbatch datasets`: public datasets with a recipe."""
+
+from __future__ import annotations
+
+import json
+from typing import Annotated
+
+import typer
+
+from mlbatch.cli.parameters import AsJson
+
+HEAD = ("name", "lidars", "data", "size", "licence", "recipe")
+
+
+def datasets(
+    name: Annotated[
+        str | None,
+        typer.Argument(help="Print this recipe, a rig to change.", show_default=False),
+    ] = None,
+    as_json: AsJson = False,
+) -> None:
+    """List public datasets that `--dataset` knows, with the pages of every fact."""
+    from mlbatch.rig.recipes import recipe, recipe_names, recipe_path
+
+    if name is not None and not as_json:
+        typer.echo(recipe_path(name, "datasets").read_text(encoding="utf-8"), nl=False)
+        return
+    found = {one: recipe(one) for one in ([name] if name else recipe_names())}
+    if as_json:
+        rows = [{"name": one, **dataset._asdict()} for one, dataset in found.items()]
+        typer.echo(json.dumps(rows, indent=1))
+        return
+    from mlbatch.cli.tables import table_lines
+
+    cells = [
+        [
+            one,
+            data.lidars,
+            data.data,
+            data.size,
+            data.licence,
+            (data.refused and "refused") or data.mark,
+        ]
+        for one, data in found.items()
+    ]
+    for line in table_lines([list(HEAD), *cells]):
+        typer.echo(line)
