@@ -71,7 +71,7 @@ def _verdict(status: BatchStatus) -> Verdict:
 def _cards(status: BatchStatus) -> dict[str, str]:
     records = status.records
     return {
-        **{state: f"{status.count(state):,}" for state in STATES},
+        **{state.replace("_", " "): f"{status.count(state):,}" for state in STATES},
         "cut off": f"{sum(one.is_cut_off for one in status.sessions):,}",
         "scans": f"{sum(one.scans for one in records):,}",
         "lost packets": loss_text(records),
