@@ -127,15 +127,19 @@ class Batcher:
         if not firsts:
             return
         if self.t_init_ns is None:
-            self._schedule.begin(max(firsts))
+            self._begin_after(max(firsts))
         self._watermark = FOREVER
+        # Scans that are batched again reach to their end; what they lack is in their gaps.
+        covered = self._policy.covered
+        end_ns = NEVER if covered is None else covered.end_ns
+        newest_ns = [max(track.newest_ns, end_ns) for track in self._tracks]
         yield from self._publish(
             Progress(
-                np.array([[track.newest_ns] * 2 for track in self._tracks]),
+                np.array([[one_ns] * 2 for one_ns in newest_ns]),
                 np.array([NEVER, FOREVER]),
                 np.array([host_ns]),
             ),
-            last_of_all=max(track.newest_ns for track in self._tracks),
+            last_of_all=max(newest_ns),
         )
 
     # -- state for reports and for the packet ring ----------------------------------------------
@@ -299,10 +303,15 @@ class Batcher:
             return len(ready)
         at = int(np.argmax(ready))
         live = present[:, at] & ~away[:, at]
-        self._schedule.begin(
+        self._begin_after(
             max(track.first_ns for track, use in zip(self._tracks, live, strict=True) if use)
         )
         return at
+
+    def _begin_after(self, t0max_ns: int) -> None:
+        """Evaluate eq. (1); scans that are batched again have no window before their first one."""
+        covered = self._policy.covered
+        self._schedule.begin(t0max_ns if covered is None else covered.begin_ns - 1)
 
     # -- step 3: enqueue columns --------------------------------------------------------------
 
@@ -445,6 +454,11 @@ class Batcher:
 
     def _is_covered(self, start: int, end: int) -> bool:
         """True if every sensor began by the start, and no stall overlaps."""
+        covered = self._policy.covered
+        if covered is not None:
+            if any(before < end and after > start for before, after in covered.gaps):
+                return False
+            start = max(start, covered.first_end_ns - 1)
         for track in self._tracks:
             if track.first_ns > start:
                 return False

@@ -7,7 +7,7 @@ sensors, t_init is the first bound after t0max.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import NamedTuple
 
 from mlbatch.arrays import F32Array, F64Array
@@ -34,6 +34,36 @@ class Limit:
         return self.ns + t_init if self.from_t_init else self.ns
 
 
+@dataclass(slots=True)
+class Coverage:
+    """What the scans of an earlier run cover in time, as far as they were read.
+
+    begin_ns, first_end_ns: of the first scan, 0 before it; end_ns: of the last; gaps: (begin, end)
+    of incomplete ones, neighbours joined.
+    """
+
+    begin_ns: int = 0
+    first_end_ns: int = 0
+    end_ns: int = 0
+    gaps: list[tuple[int, int]] = field(default_factory=list)
+
+    def begin(self) -> None:
+        """Forget all scans."""
+        self.begin_ns = 0
+        self.gaps.clear()
+
+    def add(self, start_ns: int, end_ns: int, *, is_complete: bool) -> None:
+        """Add the next scan."""
+        if not self.begin_ns:
+            self.begin_ns = start_ns
+            self.first_end_ns = end_ns
+        self.end_ns = end_ns
+        if not is_complete:
+            touches = bool(self.gaps) and self.gaps[-1][1] == start_ns
+            begin_ns = self.gaps.pop()[0] if touches else start_ns
+            self.gaps.append((begin_ns, end_ns))
+
+
 class Policy(NamedTuple):
     """Options of batching."""
 
@@ -41,6 +71,7 @@ class Policy(NamedTuple):
     keep_partial: bool = False  # also write the window before t_init and the one of the last stamp
     start: Limit | None = None  # windows start at or after it
     end: Limit | None = None  # windows start before it
+    covered: Coverage | None = None  # by the scans that are batched again
 
 
 @dataclass(slots=True)

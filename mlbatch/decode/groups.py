@@ -176,9 +176,12 @@ class SensorGroup:
             struct.kind = PLACED
             # Bytes of a slot, for prefetches.
             struct.step = self._lidar.records.size // self._slots
-            struct.runs = self._kept(np.array([first.first_byte, 0, self._slots], np.int64))
+            runs = [first.first_byte, first.labels_at, self._slots]
+            struct.runs = self._kept(np.array(runs, np.int64))
             struct.direction = self._kept(first.rotation)
             struct.origin = self._kept(first.translation_m)
+            if first.origin_m is not None:
+                struct.axis_m = self._kept(first.origin_m)
             struct.tables = len(self._lidar.firing_ns)
         elif isinstance(first, Coordinates):
             struct.kind = COORDINATES

@@ -38,15 +38,16 @@ from mlbatch.discovery.match import (
 )
 from mlbatch.discovery.router import Router
 from mlbatch.discovery.sampler import Sampler
-from mlbatch.discovery.types import DetectedSensor, Note, PacketKind
+from mlbatch.discovery.types import OUTPUT, DetectedSensor, Note, PacketKind
 from mlbatch.errors import ClockError, RecordingError, RigError, UsageError
 from mlbatch.frames.tree import FrameTree, clean, some
 from mlbatch.lidar.interface import Calibration
-from mlbatch.rig.rig import Rig, RigSensor, read_rig
-from mlbatch.types import Recording, Stream, StreamTable
+from mlbatch.rig.rig import Rig, RigSensor, StreamSelector, read_rig
+from mlbatch.types import Recording, Stream, StreamTable, WrappedRecording
 from mlbatch.units import NS_PER_S
 
 if TYPE_CHECKING:
+    from mlbatch.outputs.recording import OutputRecording
     from mlbatch.readers.bag.cloud_topics import CloudTopics
 
 # Items of a list in an error.
@@ -128,6 +129,7 @@ class Discovery:
     noted: set[PacketKind] = field(default_factory=set)
     tree: FrameTree = field(default_factory=FrameTree)  # static frames of the recording
     ignored: Ignored = field(default_factory=lambda: Ignored())
+    output: OutputRecording | None = None  # of `convert`, whose scans are batched again
 
     @property
     def sampler(self) -> Sampler:
@@ -157,11 +159,16 @@ def discover(
     address, clocks that cannot be compared. It names what is missing and how to give it.
     """
     paths = [recording.path for recording in recordings]
+    output = _output_of(recordings)
     rig = None if selection.rig is None else read_rig(selection.rig, paths)
+    if output is not None:
+        rig = output.rig
     apart = _why_apart(recordings, selection, rig)
     if apart and to_convert:
         raise RecordingError(apart)
-    recordings, clouds = with_clouds(recordings, table, rig, selection.ignore)
+    clouds = None
+    if output is None:
+        recordings, clouds = with_clouds(recordings, table, rig, selection.ignore)
     refused = {} if clouds is None else clouds.refused
     if to_convert:
         _refuse_clouds_of_rig(rig, refused, selection)
@@ -172,11 +179,16 @@ def discover(
     calibrations: list[Calibration] = []
     examined: list[Path] = []
     # Every file in the directory would be read by all vendors.
-    if rig is None or selection.metadata or not all(one.metadata for one in rig.sensors):
+    if output is None and (
+        rig is None or selection.metadata or not all(one.metadata for one in rig.sensors)
+    ):
         calibrations, examined = find_calibrations(paths, selection.metadata)
     recorded = collector.calibrations()
     calibrations += recorded
-    matched = _match(sampler, calibrations, selection, rig)
+    if output is None:
+        matched = _match(sampler, calibrations, selection, rig)
+    else:
+        matched = _match_output(sampler, output)
     lidar_kinds = [kind for kind in matched.unknown if _is_lidar(sampler, kind)]
     if to_convert and not any(sensor.kinds for sensor in matched.sensors):
         examined = examined or find_calibrations(paths, selection.metadata)[1]
@@ -223,7 +235,11 @@ def discover(
         notes.append(Note("no_overlap", "", apart))
     notes += [Note("message", "", fault) for fault in collector.faults]
     notes += extrinsics.notes
+    if output is not None:
+        notes.append(Note("clouds", "", output.describe()))
     for sensor in chosen:
+        if output is not None:
+            sensor.pose = sensor.pose._replace(source=OUTPUT)
         findings = (*sensor.notes, *sensor.lidar.notes)
         notes += [Note("calibration", sensor.name, text) for text in findings]
         if not sensor.kinds:
@@ -246,7 +262,34 @@ def discover(
         noted=set(noted),
         tree=extrinsics.tree,
         ignored=ignored,
+        output=output,
     )
+
+
+def _output_of(recordings: Sequence[Recording]) -> OutputRecording | None:
+    """The output of `convert` that is batched again, None for recordings."""
+    wrapped = recordings[0] if recordings else None
+    if not isinstance(wrapped, WrappedRecording):
+        return None
+    # Not loaded for recordings.
+    from mlbatch.outputs.recording import OutputRecording
+
+    # Segments of a recording wrap it.
+    while isinstance(wrapped, WrappedRecording) and not isinstance(wrapped, OutputRecording):
+        wrapped = wrapped.inner
+    return wrapped if isinstance(wrapped, OutputRecording) else None
+
+
+def _match_output(sampler: Sampler, output: OutputRecording) -> Matched:
+    """The lidars of an output of `convert`."""
+    found = []
+    for sensor, lidar in zip(output.rig.sensors, output.lidars, strict=True):
+        selector = sensor.stream or StreamSelector()
+        streams = sampler.table.streams
+        kinds = {kind for kind in sampler.kinds if selector.selects(streams[kind.stream])}
+        found.append(DetectedSensor(sensor.name, lidar, selector, kinds, rig=sensor))
+    taken = {kind for sensor in found for kind in sensor.kinds}
+    return Matched(found, [kind for kind in sampler.kinds if kind not in taken], {})
 
 
 def refuse_untimed(table: StreamTable, sensor: DetectedSensor, option: str) -> None:

@@ -12,6 +12,9 @@ from mlbatch.frames.tree import Chain
 from mlbatch.lidar.interface import Lidar
 from mlbatch.rig.rig import RigSensor, StreamSelector
 
+# Source of poses that an output of `convert` has.
+OUTPUT = "output"
+
 
 class PacketKind(NamedTuple):
     """Packets of one stream and one payload size.
@@ -35,8 +38,8 @@ class Pose(NamedTuple):
     """Extrinsics of a sensor."""
 
     body_from_sensor: F64Array  # (4, 4) float64, m
-    # rig, tf_static, tf, urdf, metadata or identity; of a chain through several sources the least
-    # trusted one.
+    # rig, tf_static, tf, urdf, metadata, output or identity; of a chain through several sources the
+    # least trusted one.
     source: str
     chain: Chain | None = None  # frames from body to sensor, None where the source gives the matrix
 

@@ -181,12 +181,15 @@ class PlacedPoints(NamedTuple):
     """Points that are recorded with coordinates.
 
     first_byte: in a record, of the planes x, y, z and intensity (float32, one value per slot);
-    rotation: (3, 3); translation_m: (3,).
+    rotation: (3, 3); translation_m: (3,); labels_at: first byte of the labels of the points, 0:
+    none; origin_m: (3,) from where ranges count, as points are recorded; None: from zero.
     """
 
     first_byte: int
     rotation: F32Array
     translation_m: F32Array
+    labels_at: int = 0
+    origin_m: F32Array | None = None
 
 
 class Coordinates(NamedTuple):

@@ -561,7 +561,7 @@ static void move(const float *turn, int64_t turn_step, const float *shift_m, int
     }
 }
 
-/* Placed: points that a driver computed, rotated and shifted. */
+/* Placed: points that a driver computed, rotated and shifted; their ranges count from axis_m. */
 static void read_placed(const Group *group, int64_t member, const uint8_t *record, Planes *planes)
 {
     const size_t bytes = (size_t)group->beams * sizeof(float);
@@ -580,6 +580,15 @@ static void read_placed(const Group *group, int64_t member, const uint8_t *recor
     for (int64_t beam = 0; beam < group->width; beam++) {
         range_m[beam] = sqrtf(x[beam] * x[beam] + y[beam] * y[beam] + z[beam] * z[beam]);
         keep[beam] = -(int32_t)(range_m[beam] > 0.0f);
+    }
+    const float *axis_m = group->axis_m;
+    for (int64_t beam = 0; axis_m && beam < group->beams; beam++) {
+        const float side_m[AXES] = {x[beam] - axis_m[0], y[beam] - axis_m[1], z[beam] - axis_m[2]};
+        range_m[beam] = sqrtf(side_m[0] * side_m[0] + side_m[1] * side_m[1] + side_m[2] * side_m[2]);
+    }
+    if (group->runs[1]) {
+        memset(planes->label, 0, (size_t)group->width * sizeof *planes->label);
+        memcpy(planes->label, record + group->runs[1], (size_t)group->beams * sizeof *planes->label);
     }
     move(group->direction + 9 * member, 3, group->origin + 3 * member, 1, group->width, planes);
 }
@@ -661,6 +670,11 @@ static const int64_t *labels_of(const Group *group, int64_t known, Planes *plane
     enum { FIRST_STRONG = 3, SINGLE = 7, SUM_OF_TYPES = 9 };
     const int64_t width = group->width;
     const int64_t *words = group->labels + known * group->returns * width;
+    if (group->kind == PLACED && group->runs[1]) {
+        for (int64_t beam = 0; beam < width; beam++)
+            planes->label[beam] |= (int64_t)((uint64_t)words[beam] >> LIDAR_ID_BIT << LIDAR_ID_BIT);
+        return planes->label;
+    }
     if (group->typed == NOT_TYPED)
         return words;
     const int by_level = group->typed == TYPED_BY_LEVEL;

@@ -120,7 +120,9 @@ typedef struct {
        bit 3) of the direction are not zero; TURNING: from bit 6 the same of the origin; TABLED: as
        if no vector were zero where the sign of a zero coordinate depends on all of them.
        PLACED: pixels are planes of float32 from the byte of the first run: x, y, z, intensity;
-       direction (members, 3, 3): rotation; origin (members, 3): translation, m. */
+       from the byte that is the second number of the run, unless 0, a label of each point without
+       its sensor, its time after the column; direction (members, 3, 3): rotation; origin
+       (members, 3): translation, m. */
     const float *direction;
     const float *origin;
     const int64_t *first_row;
@@ -133,7 +135,7 @@ typedef struct {
     const float *sine;
     /* TURNING whose ranges count from the axis, not from the optical centre: squares of the
        distances at which beams pass the axis (members, width), m2; NULL: others. Axis: origins of
-       near points (members, 3). */
+       near points (members, 3); PLACED: origins of ranges, as points are recorded; NULL: zeros. */
     const float *miss_m2;
     const float *axis_m;
     /* CORRECTED: planes of CORRECTIONS (width,); MIRRORED: planes of MIRRORS (width,). One member,

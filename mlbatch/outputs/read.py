@@ -22,7 +22,7 @@ from mlbatch.outputs.encoding import MessageCursor
 from mlbatch.outputs.folders import ScanFile, scan_files
 from mlbatch.outputs.kinds import FileFormat, format_of, kind_of
 from mlbatch.outputs.metadata import RunMetadata, metadata_of_grid
-from mlbatch.outputs.run_files import PIECES, RunFiles, inner_texts
+from mlbatch.outputs.run_files import PIECES, RunFiles, inner_texts, mcaps_of
 from mlbatch.outputs.scan import Scan
 from mlbatch.outputs.stored_scan import StoredScan
 from mlbatch.outputs.table import ScanRow, TableOfRun, read_table
@@ -126,32 +126,65 @@ def _run_of_mcap(log: CheckLog, output: Path, path: Path, file: McapFile) -> _Ru
     return _Run(str(path), metadata, report, table)
 
 
+def _run_of_bag(path: Path) -> _Run:
+    files = RunFiles.of(path)
+    return _Run(str(path), RunMetadata(), files.report_text(), files.table_text())
+
+
 def _scans_of_bag(log: CheckLog, path: Path) -> Iterator[Scan]:
     from mlbatch.outputs.rosbag1 import BagFile
 
-    files = RunFiles.of(path)
-    run = _Run(str(path), RunMetadata(), files.report_text(), files.table_text())
-    yield from _scans_of_messages(log, path, run, BagFile(log, path, path.name).messages())
+    messages = BagFile(log, path, path.name).messages()
+    yield from _scans_of_messages(log, path, _run_of_bag(path), messages)
 
 
 def _scans_of_messages(
     log: CheckLog, path: Path, run: _Run, messages: Iterable[Message]
 ) -> Iterator[Scan]:
-    topics = {"/points": None} | {f"/{name}/points": i for i, name in enumerate(run.sensors)}
+    scans = MessageScans(path, run)
     for message in messages:
         _refuse_damage(log, path)
-        if message.type != CLOUD or message.topic not in topics:
-            continue
+        scan = scans.scan(message)
+        if scan is not None:
+            yield scan
+    _refuse_damage(log, path)
+
+
+class MessageScans:
+    """The scans in the messages of an output, which come in their order."""
+
+    def __init__(self, path: Path, run: _Run) -> None:
+        self._path = path
+        self._run = run
+        # Topics of scans, with the only sensor of each.
+        self.topics: dict[str, int | None] = {"/points": None}
+        self.topics |= {f"/{name}/points": i for i, name in enumerate(run.sensors)}
+
+    @classmethod
+    def of_output(cls, path: Path) -> MessageScans:
+        """Those of an MCAP file or a bag."""
+        mcaps = mcaps_of(path)
+        if not mcaps:
+            return cls(path, _run_of_bag(path))
+        from mlbatch.outputs.mcap_file import McapFile
+
+        log = CheckLog()
+        file = McapFile(log, mcaps[0], mcaps[0].name)
+        return cls(path, _run_of_mcap(log, path, mcaps[0], file))
+
+    def scan(self, message: Message) -> Scan | None:
+        """The scan in a message; None for other messages."""
+        if message.type != CLOUD or message.topic not in self.topics:
+            return None
         try:
             cloud = read_cloud(MessageCursor.of_message(message.data, message.encoding))
-            index, part, start_ns, end_ns = run.window_of_message(cloud.stamp_ns)
+            index, part, start_ns, end_ns = self._run.window_of_message(cloud.stamp_ns)
             cloud = replace(cloud, stamp_ns=start_ns)
-            stored = stored_scan(cloud, message.where, topics[message.topic])
+            stored = stored_scan(cloud, message.where, self.topics[message.topic])
         except DamageError as err:
-            raise RecordingError(f"{path}: {message.topic}: {err}; convert again") from err
+            raise RecordingError(f"{self._path}: {message.topic}: {err}; convert again") from err
         stored.index, stored.slice, stored.end_ns = index, part, end_ns
-        yield run.scan(stored, cloud.frame_id)
-    _refuse_damage(log, path)
+        return self._run.scan(stored, cloud.frame_id)
 
 
 # -- a file for each scan -------------------------------------------------------------------------

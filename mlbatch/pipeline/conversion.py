@@ -17,7 +17,7 @@ from mlbatch.batching.windows import OWN, Policy, Window
 from mlbatch.clocks.host_offset import remedies
 from mlbatch.clocks.timescale import common_timescale
 from mlbatch.decode.decoder import Decoder, Source
-from mlbatch.discovery.types import Note
+from mlbatch.discovery.types import OUTPUT, Note
 from mlbatch.errors import NoScanError, PacketError, UsageError
 from mlbatch.pipeline import run_report
 from mlbatch.pipeline.decode_pool import DecodePool, DecodeTask
@@ -124,11 +124,24 @@ class Conversion:
         self.grid = Grid(rate, job.slices)
         paces = [sensor.pace() for sensor in self.sensors]
         merge = ColumnMerge([pace.positions for pace in paces])
+        output = self.session.setup.output
+        if output is not None and job.layout == "organized":
+            raise UsageError(
+                f"--layout organized: expected raw packets, found {output.path}, an output of "
+                "mlbatch convert, which does not have the shots without a return; give the "
+                "recording that was converted"
+            )
         self.batcher = Batcher(
             self.grid,
             self.session.ingest.intakes,
             # Sweeps may begin or end in partial windows.
-            Policy(job.max_wait_ns, job.keep_partial or job.is_fused, job.start, job.end),
+            Policy(
+                job.max_wait_ns,
+                job.keep_partial or job.is_fused,
+                job.start,
+                job.end,
+                None if output is None else output.coverage,
+            ),
             paces,
             merge,
         )
@@ -530,5 +543,11 @@ def sweep_cutter(sensor: Sensor) -> SweepCutter:
     """Return what cuts the columns of a sensor into sweeps."""
     from mlbatch.batching.sweeps import SweepCutter
 
+    if sensor.detected.pose.source == OUTPUT:
+        raise UsageError(
+            f"sweeps of {sensor.name}: expected the positions of its rotor, found an output of "
+            f"mlbatch convert ({sensor.lidar.calibration}), which has none; give the recording "
+            "that was converted"
+        )
     angles = sensor.lidar.beams.angle_rad
     return SweepCutter(sensor.index, None if angles is None else len(angles))

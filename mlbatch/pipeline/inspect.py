@@ -31,6 +31,7 @@ from mlbatch.discovery.sampler import MOST_KINDS, split_by_kind
 from mlbatch.discovery.types import DetectedSensor, PacketKind
 from mlbatch.errors import MlbatchError, RecordingError, RigError
 from mlbatch.native.arena import PacketArena
+from mlbatch.outputs.inputs import open_inputs
 from mlbatch.pipeline.cloud_times import CloudTimes, TimeFinding
 from mlbatch.pipeline.contents import (
     RecordingReport,
@@ -41,7 +42,6 @@ from mlbatch.pipeline.contents import (
 from mlbatch.pipeline.ingest import Ingest
 from mlbatch.pipeline.job import Job
 from mlbatch.pipeline.session import sensors_of
-from mlbatch.readers import open_recordings
 from mlbatch.readers.bag.clouds import CloudRecording
 from mlbatch.report.json_records import to_json
 from mlbatch.report.poses import PoseFigures
@@ -325,7 +325,7 @@ def inspect(
     """
     table = StreamTable()
     discovery = discover(
-        open_recordings(recordings, table, rig),
+        open_inputs(recordings, table, rig),
         table,
         SensorSelection(rig=rig, metadata=tuple(metadata), identity_extrinsics=True),
         to_convert=False,

@@ -33,6 +33,7 @@ class SensorClock:
     has_receive_times: bool  # False where packets share the log time of a message
     watch: ClockWatch  # measures timestamp minus receive time
     map: ClockMap | None = None  # of `--align-clocks`, once fitted
+    stated: str = ""  # timescale that an output of `convert` has; "": by receive times
 
     @property
     def source(self) -> str:
@@ -46,7 +47,7 @@ class SensorClock:
 
     def timescale(self, stamp_ns: int, host_ns: int) -> str:
         """Timescale of the timestamps as they are batched; host_ns: receive time of stamp_ns."""
-        return timescale(host_ns if self.by_host else stamp_ns, host_ns)
+        return self.stated or timescale(host_ns if self.by_host else stamp_ns, host_ns)
 
 
 class Limits(NamedTuple):

@@ -18,11 +18,11 @@ from mlbatch.discovery.types import Note, PacketKind
 from mlbatch.errors import RecordingError
 from mlbatch.native import require_library
 from mlbatch.native.arena import PacketArena
+from mlbatch.outputs.inputs import open_inputs
 from mlbatch.pipeline.clock_monitor import ClockMonitor
 from mlbatch.pipeline.ingest import Ingest
 from mlbatch.pipeline.job import Job, TimeSegment
 from mlbatch.pipeline.sensor import Limits, Sensor, SensorClock, new_ring
-from mlbatch.readers import open_recordings
 from mlbatch.readers.source import BUFFER_BYTES
 from mlbatch.report.report import ACCEPTED_WARNINGS
 from mlbatch.rig.rig import Rig, RigSensor
@@ -62,7 +62,7 @@ class Session:
         self._overlap: RunOverlap | None = None
         require_library()
         streams = StreamTable()
-        opened = open_recordings(job.recordings, streams, job.selection.rig)
+        opened = open_inputs(job.recordings, streams, job.selection.rig)
         if job.segment != TimeSegment():
             # Not loaded for whole sessions.
             from mlbatch.pipeline.segments import ClippedRecording
@@ -280,6 +280,7 @@ def sensors_of(setup: Discovery, job: Job, arena: PacketArena) -> list[Sensor]:
                     offset_ns=found.offset_ns,
                     has_receive_times=sampler.has_receive_times(found),
                     watch=clock_watch(lidar),
+                    stated="" if setup.output is None else setup.output.timescale,
                 ),
                 limits=limits(job, rig),
                 ring_base=ring_base,

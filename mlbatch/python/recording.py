@@ -21,6 +21,7 @@ from mlbatch.discovery.discover import Discovery, discover
 from mlbatch.discovery.types import Note
 from mlbatch.errors import NoScanError, RecordingError, UsageError
 from mlbatch.native import require_library
+from mlbatch.outputs.inputs import open_inputs
 from mlbatch.outputs.scan import Scan
 from mlbatch.outputs.table import Rows, read_table
 from mlbatch.pipeline.conversion import Conversion
@@ -36,7 +37,7 @@ from mlbatch.python.options import (
     documented,
     window_job,
 )
-from mlbatch.readers import merge, open_recordings
+from mlbatch.readers import merge
 from mlbatch.types import ImuSamples, StreamTable
 from mlbatch.units import NS_PER_S
 
@@ -118,7 +119,7 @@ class Recording:
     def _discover(self) -> Discovery:
         require_library()
         table = StreamTable()
-        opened = open_recordings(self.job.recordings, table, self.job.selection.rig)
+        opened = open_inputs(self.job.recordings, table, self.job.selection.rig)
         return discover(opened, table, replace(self.job.selection, identity_extrinsics=True))
 
     # -- description --------------------------------------------------------------------------

@@ -4,6 +4,8 @@ Points that share a timestamp are a column. A packet contains one column, so tha
 with columns that nobody measured, and every column is counted. Layout, little endian (version 1): a
 head of 24 bytes, then planes of B slots each: x, y, z (m), intensity (float32), ring (uint16),
 return type and tag (uint8); zeros up to a multiple of 8 bytes. A slot at x = y = z = 0 is empty.
+Version 2 ends with a plane of labels (int64): time after the stamp, ns (32 bits), ring (16), return
+type (8).
 """
 
 from __future__ import annotations
@@ -22,6 +24,7 @@ from mlbatch.native.library import address, library
 KINDS = ("PointCloud2", "CustomMsg")
 MAGIC = int.from_bytes(b"MLPC", "little")
 VERSION = 1
+WITH_LABELS = 2
 # `number`: of the column in its message, so that equal columns of one message stay distinct.
 HEAD = np.dtype(
     [
@@ -58,7 +61,8 @@ class Points:
     """n points of one message that have a place and a time, in its order.
 
     stamp_ns: (n,) int64; reals: (4, n) float32, x, y, z in m and intensity; ring: (n,) uint16, or
-    None without such a field; return_type, tag: (n,) uint8.
+    None without such a field; return_type, tag: (n,) uint8; label: (n,) int64 as in packets of
+    version 2, or None.
     """
 
     stamp_ns: I64Array
@@ -66,6 +70,7 @@ class Points:
     ring: U16Array | None
     return_type: U8Array
     tag: U8Array
+    label: I64Array | None = None
 
     def __len__(self) -> int:
         return len(self.stamp_ns)
@@ -78,6 +83,7 @@ class Points:
             None if self.ring is None else self.ring[index],
             self.return_type[index],
             self.tag[index],
+            None if self.label is None else self.label[index],
         )
 
 
@@ -85,12 +91,14 @@ class Points:
 class Layout:
     """Packets of a topic; kind: index into KINDS.
 
-    slots: most points of a column; by_ring: the slot of a point is its ring, else its order.
+    slots: most points of a column; by_ring: the slot of a point is its ring, else its order;
+    has_labels: packets of version 2.
     """
 
     kind: int
     slots: int
     by_ring: bool = False
+    has_labels: bool = False
 
     def __str__(self) -> str:
         if self.slots == 1:
@@ -98,16 +106,21 @@ class Layout:
         return f"up to {self.slots} points a column {'by ring' if self.by_ring else 'in turn'}"
 
     @property
+    def labels_at(self) -> int:
+        """First byte of the labels."""
+        return -(-(HEAD.itemsize + self.slots * _SLOT_BYTES) // 8) * 8
+
+    @property
     def size(self) -> int:
         """Bytes of a packet."""
-        return -(-(HEAD.itemsize + self.slots * _SLOT_BYTES) // 8) * 8
+        return self.labels_at + 8 * self.slots * self.has_labels
 
     @property
     def begin(self) -> npt.NDArray[np.void]:
         """The head, (1,), with the fields that all packets share."""
         head = np.zeros(1, HEAD)
         head["magic"] = MAGIC
-        head["version"] = VERSION
+        head["version"] = WITH_LABELS if self.has_labels else VERSION
         head["kind"] = self.kind
         head["slots"] = self.slots
         head["by_ring"] = self.by_ring
@@ -166,6 +179,11 @@ def pack(points: Points, layout: Layout, message_bytes: int) -> U8Array:
         address(used),
         address(packets),
     )
+    if points.label is not None:
+        labels = packets[:, layout.labels_at :].view(np.int64)
+        labels[placed.column, placed.slot] = (
+            points.label if placed.order is None else points.label[placed.order]
+        )
     return packets
 
 

@@ -125,11 +125,13 @@ class McapContainer:
         compression: str = NO_COMPRESSION,
         check_topic: Callable[[Topic], None] | None = None,
         on_finish: Callable[[McapContainer], None] | None = None,
+        library: str = f"mlbatch {mlbatch.__version__}",
     ) -> None:
         """Create a file.
 
         compression: as in `--compression`; check_topic: called with each forwarded topic, raises
-        ExportError to refuse it; on_finish: called once the file is complete and closed.
+        ExportError to refuse it; on_finish: called once the file is complete and closed; library:
+        in the header, by which outputs of `convert` are known.
         """
         self._file = OutputFile(path)
         self._compression, self._new_compress = compression_of(compression)
@@ -149,7 +151,7 @@ class McapContainer:
         self._attachments: list[AttachmentIndex] = []
         self._metadata: list[MetadataIndex] = []
         self._file.put(MAGIC)
-        self._file.put(encoded(Header("ros2", f"mlbatch {mlbatch.__version__}")))
+        self._file.put(encoded(Header("ros2", library)))
 
     # -- messages -----------------------------------------------------------------------------
 

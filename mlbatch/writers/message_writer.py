@@ -157,7 +157,8 @@ class MessageWriter:
             for number, sensor in enumerate(info.sensors):
                 self._topics[number] = f"/{sensor.name}/points"
         self._imu = [ImuMessages(imu_frame(sensor.name), wire) for sensor in info.sensors]
-        imu = (f"/{sensor.name}/imu" for sensor in info.sensors)
+        senders = (one for one in info.sensors if one.sensor_from_imu is not None)
+        imu = (f"/{sensor.name}/imu" for sensor in senders)
         self._own = frozenset({TF_STATIC, *self._topics.values(), *imu})
         with export_errors(self._output.partial):
             self._file = opener(self._output.partial)

@@ -20,6 +20,7 @@ from dpkt.ip import IP, IP_PROTO_UDP
 from dpkt.ip6 import IP6
 from dpkt.udp import UDP
 
+import mlbatch
 from mlbatch.arrays import I64Array, U8Array
 from mlbatch.native.capture import CaptureLoops
 from mlbatch.ros.definitions import qos, qos_in_numbers
@@ -160,7 +161,7 @@ class McapFile:
         # Not loaded for captures.
         from mlbatch.writers.mcap_container import McapContainer
 
-        self._container = McapContainer(path)
+        self._container = McapContainer(path, library=f"mlbatch extract {mlbatch.__version__}")
 
     def forward(self, message: Message) -> None:
         """Append a message; the first one creates its topic."""

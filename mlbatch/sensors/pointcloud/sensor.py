@@ -19,7 +19,16 @@ from mlbatch.errors import RigError
 from mlbatch.lidar.geometry import BeamTable, PlacedPoints
 from mlbatch.lidar.headers import EvenColumns, HeaderReader, check_of, checks
 from mlbatch.lidar.interface import Calibration, Evidence, Lidar, Records, SensorModel
-from mlbatch.ros.point_packets import HEAD, KINDS, MAGIC, MOST_SLOTS, REALS, VERSION, Layout
+from mlbatch.ros.point_packets import (
+    HEAD,
+    KINDS,
+    MAGIC,
+    MOST_SLOTS,
+    REALS,
+    VERSION,
+    WITH_LABELS,
+    Layout,
+)
 from mlbatch.sensors.base import BaseLidar
 from mlbatch.sensors.options import check_options
 
@@ -56,9 +65,10 @@ def _layout(sample: U8Array) -> Layout | None:
         return None
     kind = int(first["kind"])
     slots = int(first["slots"])
-    if (int(first["magic"]), int(first["version"])) != (MAGIC, VERSION):
+    version = int(first["version"])
+    if int(first["magic"]) != MAGIC or version not in (VERSION, WITH_LABELS):
         return None
-    layout = Layout(kind, slots, bool(first["by_ring"]))
+    layout = Layout(kind, slots, bool(first["by_ring"]), version == WITH_LABELS)
     known = kind < len(KINDS) and 0 < slots <= MOST_SLOTS and layout.size == sample.shape[1]
     return layout if known else None
 
@@ -107,13 +117,14 @@ def describe(size: int, sample: U8Array) -> str | None:
 
 
 class CloudLidar(BaseLidar):
-    """A topic of clouds; implements `Lidar`."""
+    """A topic of clouds; implements `Lidar`. Points with labels are in the body frame."""
 
     sends_twice = False
     typed_by = ""
 
     def __init__(self, layout: Layout, topic: str) -> None:
         slots = layout.slots
+        self._layout = layout
         self.model = KINDS[layout.kind]
         # Names the sensor if its topic does not.
         self.vendor = "Cloud"
@@ -125,9 +136,10 @@ class CloudLidar(BaseLidar):
         self.columns_per_packet = 1
         self.records = Records(0, layout.size, layout.size)
         # In columns of one point the rotor word carries the ring.
-        rings = _RINGS if slots == 1 else 1
+        has_ring_words = slots == 1 and not layout.has_labels
+        rings = _RINGS if has_ring_words else 1
         self.channel = (
-            np.arange(slots) + np.arange(rings)[:, None] if slots == 1 else np.arange(slots)
+            np.arange(slots) + np.arange(rings)[:, None] if has_ring_words else np.arange(slots)
         )
         self.firing_ns = np.zeros((rings, slots), np.int64)
         nowhere = np.zeros((3, slots, 3))
@@ -144,7 +156,7 @@ class CloudLidar(BaseLidar):
                 interval_at=-1,
                 interval_ns=0,
                 counter_at=-1,
-                ring_at=HEAD.itemsize + 4 * REALS if slots == 1 else -1,
+                ring_at=HEAD.itemsize + 4 * REALS if has_ring_words else -1,
                 rings=_RINGS,
             ),
             has_number=False,
@@ -152,6 +164,14 @@ class CloudLidar(BaseLidar):
 
     def projection(self, body_from_sensor: F64Array) -> PlacedPoints:
         """Transform of the recorded coordinates."""
+        if self._layout.has_labels:
+            return PlacedPoints(
+                HEAD.itemsize,
+                np.eye(3, dtype=np.float32),
+                np.zeros(3, np.float32),
+                self._layout.labels_at,
+                body_from_sensor[:3, 3].astype(np.float32),
+            )
         return PlacedPoints(
             HEAD.itemsize,
             body_from_sensor[:3, :3].astype(np.float32),
