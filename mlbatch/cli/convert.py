@@ -26,13 +26,7 @@ def convert(
 
     if values["engine"]:
         typer.echo("mlbatch: --engine is ignored, since everything is compiled", err=True)
-    job = job_of(recordings, values)
-    if values["dataset"] and not values["quiet"]:
-        from mlbatch.cli.summary import say
-        from mlbatch.rig.recipes import recipe
-
-        say(f"--dataset {values['dataset']}: {recipe(values['dataset']).caution}")
-    run(job, target_of(values))
+    run(job_of(recordings, values), target_of(values))
 
 
 with_parameters(convert, map(parameter, options.CONVERT))

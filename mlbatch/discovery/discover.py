@@ -201,6 +201,8 @@ def discover(
     ignored = Ignored(tuple(left_out), selection.ignore, bool(selection.only))
     noted = [kind for kind in lidar_kinds if not _is_ignored(sampler, ignored, kind)]
     notes: list[Note] = []
+    if rig is not None and rig.dataset is not None:
+        notes.append(Note("dataset", "", f"{rig.dataset.title}: recipe {rig.dataset.caution}"))
     if rig is None:
         unmatched = _unmatched(sampler, matched, noted, examined, _names(examined, recorded))
         if to_convert:

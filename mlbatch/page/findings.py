@@ -61,8 +61,9 @@ REMEDIES = {
     "max_wait": "give --max-wait in seconds",
     "cloud_time": "state unit or from of points, or the clock, in the rig, as the warning says",
     "clouds": "nothing to do; check that the interpretation is correct",
+    "dataset": "check a few seconds of scans; the pages of each fact: mlbatch datasets --json",
 }
-_INFORMATION = frozenset({"clouds", "constant_tf"})
+_INFORMATION = frozenset({"clouds", "constant_tf", "dataset"})
 _SERIOUS = frozenset({"clocks", "clock_jump", "cut_off", "recording", "clock_epoch"})
 
 _FINE = "Packets, windows and clocks are fine"

@@ -43,9 +43,9 @@ SCHEMA = "mlbatch.report/1"
 _OF_MACHINE = ("timing", "command", "identity", "map")
 # The warning that a recording ends early.
 CUT_OFF = "cut_off"
-# Warnings that are no error with `--strict`: one is for information, one states what the user asked
-# for by an option of that name.
-ACCEPTED_WARNINGS = frozenset({"clouds", "identity_extrinsics"})
+# Warnings that are no error with `--strict`: two are for information, one states what the user
+# asked for by an option of that name.
+ACCEPTED_WARNINGS = frozenset({"clouds", "dataset", "identity_extrinsics"})
 
 
 class InputReport(NamedTuple):

@@ -8,12 +8,12 @@ from __future__ import annotations
 
 import difflib
 import re
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
 from mlbatch.errors import UsageError
-from mlbatch.rig.keys import TEXT, Key, choice_form, mapping_form, names
+from mlbatch.rig.keys import Key
 from mlbatch.rig.rig import DATASET
 from mlbatch.rig.yaml_tree import Node, read_yaml
 
@@ -25,7 +25,7 @@ UNKNOWN = "not verified"
 
 _TEXT = re.compile(r"\S(.*\S)?")
 _PAGE = re.compile(r"https?://\S+")
-# Folders above a recording in which a dataset may have its calibration.
+# Folders, with those above a recording, in which a dataset may have its calibration.
 _LEVELS = 3
 _NAMED_PART = re.compile(r"\{stamp[^}]*\}")
 
@@ -33,8 +33,9 @@ _NAMED_PART = re.compile(r"\{stamp[^}]*\}")
 class Dataset(NamedTuple):
     """Facts about a public dataset.
 
-    recording: what is given to `mlbatch convert`; signs: further topics or files of its
-    recordings; pages: URLs by fact, none: not verified; refused: why it cannot be batched, or "".
+    recording: what is given to `mlbatch convert`; pages: URLs by fact, none: not verified;
+    not_verified: what no page says; refused: why it cannot be batched, or ""; signs: further topics
+    or files by which it is recognised.
     """
 
     title: str
@@ -56,16 +57,26 @@ class Dataset(NamedTuple):
         return "; not verified: ".join([self.mark, *filter(None, [", ".join(self.not_verified)])])
 
 
+_REQUIRED = tuple(name for name in Dataset._fields if name not in Dataset._field_defaults)
+_LISTS = ("not_verified", "signs")
+
+
+def dataset_of(node: Node) -> Dataset:
+    """The facts of a recipe; RigError for the first mistake."""
+    fields = node.fields(Dataset._fields, _REQUIRED)
+    fields["mark"].choice(MARKS)
+    fields["data"].choice(CONTENTS)
+    pages = fields["pages"].fields(FACTS, FACTS)
+    lists = {
+        name: tuple(map(_text, fields[name].elements("texts"))) for name in _LISTS if name in fields
+    }
+    others = {name: _text(fields[name]) for name in fields if name not in (*_LISTS, "pages")}
+    urls = {fact: _urls(value) for fact, value in pages.items()}
+    return Dataset(**{**others, **lists, "pages": urls})  # type: ignore[arg-type]
+
+
 def _text(node: Node) -> str:
     return node.word("a text", _TEXT)
-
-
-def _texts(node: Node) -> tuple[str, ...]:
-    return tuple(map(_text, node.elements("texts")))
-
-
-def _pages(node: Node) -> Mapping[str, tuple[str, ...]]:
-    return {fact: _urls(value) for fact, value in node.fields(FACTS, FACTS).items()}
 
 
 def _urls(node: Node) -> tuple[str, ...]:
@@ -75,53 +86,11 @@ def _urls(node: Node) -> tuple[str, ...]:
     return tuple(item.word(f"the URL of a page, or {UNKNOWN}", _PAGE) for item in items)
 
 
-def _key(name: str, about: str) -> Key[str]:
-    return Key(name, _text, "", TEXT, about)
-
-
-def _choice_key(name: str, words: Sequence[str], about: str) -> Key[str]:
-    return Key(name, lambda node: node.choice(words), "", choice_form(*words), about)
-
-
-def _texts_key(name: str, about: str) -> Key[tuple[str, ...]]:
-    return Key(name, _texts, (), {"type": "array", "items": TEXT}, about)
-
-
-_PAGES: Key[Mapping[str, tuple[str, ...]]] = Key(
-    "pages",
-    _pages,
-    {},
-    {"type": "object", "propertyNames": {"enum": list(FACTS)}},
-    f"URL or URLs of each fact, or {UNKNOWN}",
-)
-_KEYS = (
-    _key("title", "its name"),
-    _choice_key("mark", MARKS, "how the recipe was checked"),
-    _key("lidars", "number and models"),
-    _choice_key("data", CONTENTS, "what is recorded"),
-    _key("size", "of all recordings"),
-    _key("licence", "of the dataset"),
-    _key("recording", "what is given to `mlbatch convert`"),
-    _PAGES,
-    _texts_key("not_verified", "what no page says"),
-    _key("remarks", "limits"),
-    _key("refused", "why it cannot be batched"),
-    _texts_key("signs", "further topics or files by which it is recognised"),
-)
-_REQUIRED = ("title", "mark", "lidars", "data", "size", "licence", "recording", "pages")
-
-
-def dataset_of(node: Node) -> Dataset:
-    """The facts of a recipe; RigError for the first mistake."""
-    fields = node.fields(names(_KEYS), _REQUIRED)
-    return Dataset(**{key.name: key.of(fields) for key in _KEYS})  # type: ignore[arg-type]
-
-
 DATASET_KEY: Key[Dataset | None] = Key(
     DATASET,
     dataset_of,
     None,
-    mapping_form(_KEYS, required=_REQUIRED),
+    {"type": "object", "required": list(_REQUIRED)},
     "facts about a public dataset; files are searched around the recordings",
 )
 
@@ -212,44 +181,32 @@ def _found(node: Node, folders: Sequence[Path], dataset: Dataset) -> Path:
 
 def by_topics(topics: Collection[str]) -> list[str]:
     """Datasets all of whose topics are there, those with the most of them first."""
-    found = []
-    for name, root in _roots():
-        lidars = {_part(sensor, "stream", "topic") for sensor in _sensors(root)} - {""}
-        needed = lidars | set(dataset_of(root.entries[DATASET]).signs)
-        # One topic alone is that of many recordings.
-        if lidars and len(needed) > 1 and needed <= set(topics):
-            found.append((-len(needed), name))
-    return [name for _, name in sorted(found)]
+    # One topic alone is that of many recordings.
+    return _with_most("stream", "topic", 2, lambda topic: topic in topics)
 
 
 def by_files(folder: Path) -> list[str]:
     """Datasets whose files of sweeps are in a folder, those with the most lidars first."""
+    return _with_most(
+        "points", "glob", 1, lambda glob: any(folder.glob(_NAMED_PART.sub("*", glob)))
+    )
+
+
+def _with_most(section: str, key: str, least: int, is_there: Callable[[str], bool]) -> list[str]:
+    """Recipes of which a key of the sensors, and all signs, are there."""
     found = []
-    for name, root in _roots():
-        globs = [
-            _NAMED_PART.sub("*", glob.replace("{sensor}", sensor.entries["name"].text))
-            for sensor in _sensors(root)
-            if (glob := _part(sensor, "points", "glob"))
-        ]
-        signs = dataset_of(root.entries[DATASET]).signs
-        if globs and all(any(folder.glob(glob)) for glob in (*globs, *signs)):
-            found.append((-len(globs), name))
-    return [name for _, name in sorted(found)]
-
-
-def _roots() -> Iterator[tuple[str, Node]]:
     for name in recipe_names():
-        yield name, read_yaml(FOLDER / f"{name}.yaml")
-
-
-def _sensors(root: Node) -> Sequence[Node]:
-    return root.entries["sensors"].items if "sensors" in root.entries else ()
-
-
-def _part(sensor: Node, section: str, key: str) -> str:
-    """Text of a key of a section of a sensor; "" without one."""
-    node = sensor.entries.get(section)
-    return "" if node is None or key not in node.entries else node.entries[key].text
+        root = read_yaml(FOLDER / f"{name}.yaml")
+        words = set(dataset_of(root.entries[DATASET]).signs)
+        for sensor in root.entries["sensors"].items if "sensors" in root.entries else ():
+            node = sensor.entries.get(section)
+            if node is None or key not in node.entries:
+                break
+            words.add(node.entries[key].text.replace("{sensor}", sensor.entries["name"].text))
+        else:
+            if len(words) >= least and all(map(is_there, words)):
+                found.append((-len(words), name))
+    return [name for _, name in sorted(found)]
 
 
 def proposal(found: Sequence[str]) -> str:

@@ -15,6 +15,7 @@ from mlbatch.types import Stream
 
 if TYPE_CHECKING:
     from mlbatch.rig.convert_keys import RigOption
+    from mlbatch.rig.recipes import Dataset
     from mlbatch.ros.point_times import PointRule
 
 DEFAULT_BODY_FRAME = "base_link"
@@ -115,7 +116,7 @@ class Rig:
     """The sensors in the order of `lidar_id`, and settings of all.
 
     exclude_boxes_m: (k, 6) float64, x0, y0, z0, x1, y1, z1 in the body frame; options: of
-    `mlbatch convert`.
+    `mlbatch convert`; dataset: that it is a recipe for.
     """
 
     sensors: tuple[RigSensor, ...]
@@ -123,6 +124,7 @@ class Rig:
     rate: Fraction | None = None
     exclude_boxes_m: F64Array = field(default_factory=no_boxes)
     options: tuple[RigOption, ...] = ()
+    dataset: Dataset | None = None
 
 
 def read_rig(path: Path, recordings: Sequence[Path] = ()) -> Rig:

@@ -621,6 +621,7 @@ def rig_from(root: Node) -> Rig:
         sensors=tuple(_sensor(item, body_frame) for item in _SENSORS.of(fields)),
         exclude_boxes_m=_BOXES.of(fields),
         options=_CONVERT.of(fields),
+        dataset=DATASET_KEY.of(fields),
     )
     _check_distinct(fields["sensors"], rig)
     return rig

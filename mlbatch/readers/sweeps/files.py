@@ -12,7 +12,6 @@ import re
 import struct
 import zipfile
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -43,44 +42,46 @@ class SweepError(Exception):
     """A file that cannot be read as a sweep: file, expected, found, remedy."""
 
 
-@dataclass(frozen=True, slots=True)
-class _Points:
-    """Points of a file; fields: name, type and offset of those that a cloud can have."""
-
-    fields: tuple[tuple[str, str, int], ...]
-    step: int
-    data: bytes
+_Array = npt.NDArray[Any]
+# A number for each point, by field.
+_Columns = Mapping[str, _Array]
 
 
 def read_sweep(path: Path, sweeps: Sweeps, stamp_ns: int) -> bytes:
     """Return a PointCloud2 in ROS 1 serialisation with the points of a file."""
-    return _message(_points(path, sweeps), stamp_ns)
+    columns = _columns(path, sweeps)
+    fields = {name: _kind(column) for name, column in columns.items()}
+    sizes = {len(column) for column in columns.values()}
+    if not all(fields.values()) or len(sizes) != 1:
+        shown = ", ".join(f"{name} {_shown(column)}" for name, column in columns.items())
+        raise SweepError(
+            f"{path}: expected one number for each point in each field, found {shown or 'none'}; "
+            "correct the description, or leave a field out"
+        )
+    rows = np.zeros(sizes.pop(), [(name, f"<{kind}") for name, kind in fields.items()])
+    for name, column in columns.items():
+        rows[name] = column
+    return _message(rows, stamp_ns)
 
 
 def first_ns(path: Path, sweeps: Sweeps, rule: PointRule) -> int:
     """The earliest time of the points of a file, which count from 1970 in the unit of the rule."""
-    points = _points(path, sweeps)
-    known = {name: (f"<{kind}", offset) for name, kind, offset in points.fields}
-    name = rule.time or next((name for name in TIME_NAMES if name in known), "")
-    if name not in known or not rule.unit_ns:
+    columns = _columns(path, sweeps)
+    name = rule.time or next((name for name in TIME_NAMES if name in columns), "")
+    if name not in columns or not rule.unit_ns:
         raise SweepError(
             f"{path}: expected the time of the sweep as its name, or points with times from 1970 "
-            f"as `time` and `unit`, found fields {', '.join(known)} and unit "
+            f"as `time` and `unit`, found fields {', '.join(columns)} and unit "
             f"{rule.keys()['unit'] or 'none'}; give both in the rig"
         )
-    kind, offset = known[name]
-    layout = np.dtype(
-        {"names": [name], "formats": [kind], "offsets": [offset], "itemsize": points.step}
-    )
-    times: _Array = np.frombuffer(points.data, layout)[name]
-    if not len(times):
+    if not len(columns[name]):
         raise SweepError(f"{path}: expected points, found none; remove it")
+    first: float = columns[name].min().item()
     # In two parts: a float64 of ns since 1970 has a step of 256.
-    whole, part = divmod(float(times.min()), 1)
-    return int(whole) * rule.unit_ns + round(part * rule.unit_ns)
+    return int(first // 1) * rule.unit_ns + round(first % 1 * rule.unit_ns)
 
 
-def _points(path: Path, sweeps: Sweeps) -> _Points:
+def _columns(path: Path, sweeps: Sweeps) -> _Columns:
     """The points of a file in any of the formats."""
     try:
         data = read_bytes(path, MOST_BYTES)
@@ -97,7 +98,7 @@ def _points(path: Path, sweeps: Sweeps) -> _Points:
     if not data:
         raise SweepError(f"{path}: expected points, found 0 bytes; remove it or copy it again")
     if data.startswith((_NPY_HEAD, _ZIP_HEAD)):
-        return _of_columns(path, _columns(path, data, sweeps))
+        return _of_arrays(path, data, sweeps)
     is_pcd = data.startswith(_PCD_HEADS)
     if is_pcd and (sweeps.fields or sweeps.arrays):
         raise SweepError(
@@ -112,41 +113,32 @@ def _points(path: Path, sweeps: Sweeps) -> _Points:
     return _pcd(path, data) if is_pcd else _raw(path, data, sweeps)
 
 
-def _raw(path: Path, data: bytes, sweeps: Sweeps) -> _Points:
-    step = sum(int(kind[1:]) for _, kind in sweeps.fields)
-    if len(data) % step:
+def _raw(path: Path, data: bytes, sweeps: Sweeps) -> _Columns:
+    layout = _layout(sweeps.fields)
+    if len(data) % layout.itemsize:
         raise SweepError(
-            f"{path}: expected a multiple of {step} bytes, the size of a point of the dtype, found "
-            f"{len(data)}; correct `dtype`, or copy the file again"
+            f"{path}: expected a multiple of {layout.itemsize} bytes, the size of a point of the "
+            f"dtype, found {len(data)}; correct `dtype`, or copy the file again"
         )
-    return _Points(*_offsets(_narrow(sweeps.fields)), _as_floats(data, sweeps.fields))
+    return _named(sweeps.fields, np.frombuffer(data, layout))
 
 
-def _narrow(fields: Sequence[tuple[str, str]]) -> list[tuple[str, str]]:
-    """Fields with float64 for whole numbers of 64 bits."""
-    return [(name, "f8" if kind in _WIDE else kind) for name, kind in fields]
+def _layout(fields: Sequence[tuple[str, str]]) -> np.dtype[Any]:
+    """Fields one after another, named by their numbers."""
+    return np.dtype(
+        [(str(at), kind if kind[0] == "V" else f"<{kind}") for at, (_, kind) in enumerate(fields)]
+    )
 
 
-def _offsets(
-    fields: Sequence[tuple[str, str]],
-) -> tuple[tuple[tuple[str, str, int], ...], int]:
-    """Fields without padding, with their offsets; and the size of a point."""
-    found = []
-    offset = 0
-    for name, kind in fields:
-        if kind in _NUMBERS:
-            found.append((name, kind, offset))
-        # The bytes of a type are its last digits: f4, V12.
-        offset += int(kind[1:])
-    return tuple(found), offset
+def _named(fields: Sequence[tuple[str, str]], rows: _Array) -> _Columns:
+    """The fields that a cloud can have."""
+    return {name: rows[str(at)] for at, (name, kind) in enumerate(fields) if kind[0] != "V"}
 
 
 # -- numpy arrays ---------------------------------------------------------------------------------
 
-_Array = npt.NDArray[Any]
 
-
-def _columns(path: Path, data: bytes, sweeps: Sweeps) -> Mapping[str, _Array]:
+def _of_arrays(path: Path, data: bytes, sweeps: Sweeps) -> _Columns:
     """An array for each field of the points of a .npy or .npz file."""
     arrays = _arrays(path, data)
     if "" not in arrays:
@@ -204,22 +196,6 @@ def _column(path: Path, arrays: Mapping[str, _Array], name: str) -> _Array:
     return array
 
 
-def _of_columns(path: Path, columns: Mapping[str, _Array]) -> _Points:
-    fields = {name: _kind(column) for name, column in columns.items()}
-    sizes = {len(column) for column in columns.values()}
-    lacking = [name for name, kind in fields.items() if not kind]
-    if lacking or len(sizes) != 1:
-        shown = ", ".join(f"{name} {_shown(column)}" for name, column in columns.items())
-        raise SweepError(
-            f"{path}: expected one number for each point in each field, found {shown}; correct "
-            "`arrays`, or leave a field out"
-        )
-    rows = np.zeros(sizes.pop(), [(name, f"<{kind}") for name, kind in fields.items()])
-    for name, column in columns.items():
-        rows[name] = column
-    return _Points(*_offsets(list(fields.items())), rows.tobytes())
-
-
 def _kind(column: _Array) -> str:
     """Type of a PointField that holds the numbers of an array; "" for others."""
     kind, size = column.dtype.kind, column.dtype.itemsize
@@ -236,7 +212,7 @@ def _shown(array: _Array) -> str:
 # -- PCD ------------------------------------------------------------------------------------------
 
 
-def _pcd(path: Path, data: bytes) -> _Points:
+def _pcd(path: Path, data: bytes) -> _Columns:
     head, body = _pcd_head(path, data)
     fields: list[tuple[str, str]] = []
     names = head["FIELDS"].split()
@@ -258,10 +234,10 @@ def _pcd(path: Path, data: bytes) -> _Points:
         single = text in (*_NUMBERS, *_WIDE) and repeated == "1" and name != "_"
         fields.append((name, text if single else f"V{int(size) * int(repeated)}"))
     count = _count(path, head)
-    found, step = _offsets(_narrow(fields))
+    step = sum(int(kind[1:]) for _, kind in fields)
     kind = head["DATA"].split()[0] if head["DATA"].split() else ""
     if kind == "ascii":
-        return _Points(found, step, _as_floats(_ascii(path, body, fields, count), fields))
+        return _named(fields, _ascii(path, body, fields, count))
     if kind != "binary":
         raise SweepError(
             f"{path}: expected DATA binary or ascii, found {kind!r}; convert it with PCL: "
@@ -272,20 +248,7 @@ def _pcd(path: Path, data: bytes) -> _Points:
             f"{path}: expected {count} points of {step} bytes, found {len(body)} bytes of data; "
             "copy the file again"
         )
-    return _Points(found, step, _as_floats(body[: step * count], fields))
-
-
-def _as_floats(data: bytes, fields: Sequence[tuple[str, str]]) -> bytes:
-    """Points with the whole numbers of 64 bits as float64, where they are."""
-    if not any(kind in _WIDE for _, kind in fields):
-        return data
-    before, after = (
-        np.dtype(
-            [(f"{at}", f"<{kind}" if kind[0] != "V" else kind) for at, kind in enumerate(kinds)]
-        )
-        for kinds in ([kind for _, kind in part] for part in (fields, _narrow(fields)))
-    )
-    return np.frombuffer(data, before).astype(after).tobytes()
+    return _named(fields, np.frombuffer(body[: step * count], _layout(fields)))
 
 
 def _pcd_head(path: Path, data: bytes) -> tuple[dict[str, str], bytes]:
@@ -321,14 +284,14 @@ def _count(path: Path, head: dict[str, str]) -> int:
     return int(values[2])
 
 
-def _ascii(path: Path, body: bytes, fields: Sequence[tuple[str, str]], count: int) -> bytes:
-    """The numbers of a file of text, as bytes of the fields."""
+def _ascii(path: Path, body: bytes, fields: Sequence[tuple[str, str]], count: int) -> _Array:
+    """The numbers of a file of text."""
     if any(kind.startswith("V") for _, kind in fields):
         raise SweepError(
             f"{path}: expected fields of one number in DATA ascii, found others; convert it with "
             "PCL: pcl_convert_pcd_ascii_binary IN OUT 1"
         )
-    layout = np.dtype([(f"{name}_{at}", f"<{kind}") for at, (name, kind) in enumerate(fields)])
+    layout = _layout(fields)
     rows = np.zeros(0, layout)
     try:
         if body.strip():
@@ -340,21 +303,21 @@ def _ascii(path: Path, body: bytes, fields: Sequence[tuple[str, str]], count: in
         ) from err
     if len(rows) != count:
         raise SweepError(f"{path}: expected {count} lines, found {len(rows)}; copy the file again")
-    return rows.tobytes()
+    return rows
 
 
 # -- message --------------------------------------------------------------------------------------
 
 
-def _message(points: _Points, stamp_ns: int) -> bytes:
+def _message(rows: _Array, stamp_ns: int) -> bytes:
     """A sensor_msgs/PointCloud2 in ROS 1 serialisation, without a frame_id."""
-    count = len(points.data) // points.step
     seconds, rest = divmod(stamp_ns, NS_PER_S)
+    fields: Mapping[str, Any] = rows.dtype.fields or {}
     head = struct.pack("<IIII", 0, seconds, rest, 0)
-    head += struct.pack("<III", 1, count, len(points.fields))
-    for name, kind, offset in points.fields:
+    head += struct.pack("<III", 1, len(rows), len(fields))
+    for name, (kind, offset, *_) in fields.items():
         text = name.encode()
         head += struct.pack("<I", len(text)) + text
-        head += struct.pack("<IBI", offset, _NUMBERS[kind], 1)
-    head += struct.pack("<BIII", 0, points.step, len(points.data), len(points.data))
-    return b"".join((head, points.data, b"\1"))
+        head += struct.pack("<IBI", offset, _NUMBERS[f"{kind.kind}{kind.itemsize}"], 1)
+    head += struct.pack("<BIII", 0, rows.dtype.itemsize, rows.nbytes, rows.nbytes)
+    return b"".join((head, rows.tobytes(), b"\1"))
