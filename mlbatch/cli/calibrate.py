@@ -100,13 +100,12 @@ def calibrate(
     typer.echo(paragraph(found.title()))
     for line in table_lines(found.rows()):
         typer.echo(line)
-    if found.pairs:
-        typer.echo("")
-        for line in table_lines(found.pair_rows()):
+    for rows in (found.pair_rows() if found.pairs else [], found.imu_rows()):
+        for line in ["", *table_lines(rows)] if rows else []:
             typer.echo(line)
-    if found.level:
+    for note in found.notes():
         typer.echo("")
-        typer.echo(paragraph(f"note: {found.level}"))
+        typer.echo(paragraph(f"note: {note}"))
     for path in (output, html):
         if path is not None:
             typer.echo(one_line(f"wrote {path}"))

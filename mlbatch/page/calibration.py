@@ -51,6 +51,8 @@ def calibration_page(title: str, found: Calibration, command: str) -> str:
         else [_pictures(found.view, cut) for cut in _cuts(found.view.after)],
         lidars=found.rows(),
         pairs=found.pair_rows(),
+        imus=found.imu_rows(),
+        notes=[imu.refusal for imu in found.imus if imu.refusal],
         command=command,
     )
 

@@ -95,6 +95,14 @@ class PacketUser(Protocol):
         ...
 
 
+class ImuUser(Protocol):
+    """Takes samples of IMUs and messages, as they are read."""
+
+    def add(self, imu: Iterable[ImuSamples], messages: Iterable[Message]) -> None:
+        """Take those of a batch."""
+        ...
+
+
 class SkippedWindow(NamedTuple):
     """A window with columns that gives no scan (`--drop-incomplete`)."""
 
@@ -106,8 +114,8 @@ class Conversion:
 
     info, table: None before the first window; poses: known once closed; map: of `--accumulate`,
     known at the end; dropped_incomplete: windows left out by `--drop-incomplete`;
-    notes_before_points: number of warnings that precede those about points; users: of raw packets,
-    besides the run itself.
+    notes_before_points: number of warnings that precede those about points; users, imu_users: of
+    raw packets and of samples of IMUs, besides the run itself.
     """
 
     def __init__(self, job: Job, buffers: int = 1, progress: Progress | None = None) -> None:
@@ -160,6 +168,7 @@ class Conversion:
         self.dropped_incomplete = 0
         self.notes_before_points = 0
         self.deskew = self._deskew()
+        self.imu_users: list[ImuUser] = [] if self.deskew is None else [self.deskew]
         self.poses = PoseFigures(ONE_LIDAR if job.checks_poses else NOT_ASKED)
         self.pose_check = self._new_pose_check()
         self.map: MapFigures | None = None
@@ -250,8 +259,8 @@ class Conversion:
             for batch in self.stages.each("read_s", packets):
                 # Steps 1 and 2: the sensor of each packet, the timestamps of its columns.
                 ingested = self.session.ingest.columns(batch)
-                if self.deskew is not None:
-                    self.deskew.add(ingested.imu, batch.messages)
+                for user in self.imu_users:
+                    user.add(ingested.imu, batch.messages)
                 self.passthrough.add(ingested.imu, batch.messages, self.batcher.limits_ns)
                 self._refuse_rejected()
                 # Steps 3 and 4: columns by timestamp; windows close behind the watermark.

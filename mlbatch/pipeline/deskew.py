@@ -91,6 +91,48 @@ class Trajectory:
         """Nothing."""
 
 
+class ImuStreams:
+    """Samples of the IMUs of a recording, by the number of their lidar or the name of their topic.
+
+    Stamps of lidars are in the common clock, those of messages as their headers have them.
+    """
+
+    def __init__(self, sensors: Sequence[Sensor]) -> None:
+        self._sensors = sensors
+        self.waiting: dict[int | str, list[_Samples]] = {}
+        self.frame_of: dict[str, str] = {}
+        self.topics: dict[str, Topic] = {}
+
+    def add(self, imu: Iterable[ImuSamples], messages: Iterable[Message]) -> None:
+        """Keep the samples of a batch."""
+        for samples in imu:
+            stamp_ns = samples.stamp_ns + self._sensors[samples.sensor].clock.imu_offset_ns
+            near = np.zeros(len(stamp_ns), np.int64)
+            one = (stamp_ns, samples.acceleration, samples.angular_velocity, near)
+            self._keep(samples.sensor, one)
+        for message in messages:
+            if message.topic.type == IMU_TYPE:
+                found = _sample_of(message)
+                if found is not None:
+                    frame, sample = found
+                    self.frame_of.setdefault(message.topic.name, frame)
+                    self.topics.setdefault(message.topic.name, message.topic)
+                    self._keep(message.topic.name, sample)
+
+    def _keep(self, key: int | str, samples: _Samples) -> None:
+        if len(samples[0]):
+            self.waiting.setdefault(key, []).append(samples)
+
+    def rates(self) -> Iterator[tuple[int | str, I64Array, F64Array]]:
+        """Increasing stamps (n,) of each IMU and its angular velocity (n, 3), its frame, rad/s."""
+        # Lidars before topics.
+        for key in sorted(self.waiting, key=lambda key: (isinstance(key, str), str(key))):
+            parts = self.waiting[key]
+            stamp_ns, _, rate, _ = (np.concatenate(part) for part in zip(*parts, strict=True))
+            stamp_ns, first = np.unique(stamp_ns, return_index=True)
+            yield key, stamp_ns, rate[first]
+
+
 class ImuPoses:
     """Poses integrated from the first IMU of a lidar, else from the first Imu topic."""
 
@@ -111,10 +153,7 @@ class ImuPoses:
         self.line = PoseLine(_NO_POSES)
         self._sensors = sensors
         self._frames = frames
-        # Samples that wait, by the number of their sensor or the name of their topic.
-        self._waiting: dict[int | str, list[_Samples]] = {}
-        self._frame_of: dict[str, str] = {}
-        self._topics: dict[str, Topic] = {}
+        self._streams = ImuStreams(sensors)
         self._topic_offset_ns = offset_ns
         self._chosen: int | str | None = None
         self._integrator: Integrator | None = None
@@ -142,37 +181,25 @@ class ImuPoses:
 
     def add(self, imu: Iterable[ImuSamples], messages: Iterable[Message]) -> None:
         """Keep the samples of a batch."""
-        for samples in imu:
-            offset_ns = self._sensors[samples.sensor].clock.imu_offset_ns
-            stamp_ns = samples.stamp_ns + offset_ns
-            near = np.zeros(len(stamp_ns), np.int64)
-            one = (stamp_ns, samples.acceleration, samples.angular_velocity, near)
-            self._keep(samples.sensor, one)
-        for message in messages:
-            if message.topic.type == IMU_TYPE:
-                found = _sample_of(message)
-                if found is not None:
-                    frame, sample = found
-                    self._frame_of.setdefault(message.topic.name, frame)
-                    self._topics.setdefault(message.topic.name, message.topic)
-                    self._keep(message.topic.name, sample)
+        self._streams.add(imu, messages)
+        if self._chosen is not None:
+            self._drop_others(self._chosen)
 
-    def _keep(self, key: int | str, samples: _Samples) -> None:
-        if self._chosen in (None, key) and len(samples[0]):
-            self._waiting.setdefault(key, []).append(samples)
+    def _drop_others(self, key: int | str) -> None:
+        self._streams.waiting = {key: self._streams.waiting.get(key, [])}
 
     def advance(self, oldest_ns: int) -> None:
         """Integrate the samples that wait."""
         if self._chosen is None and not self._choose():
             return
-        parts = self._waiting.pop(self._chosen, []) if self._chosen is not None else []
+        parts = self._streams.waiting.pop(self._chosen, []) if self._chosen is not None else []
         if not parts or self._integrator is None:
             return
         stamp_ns, force, rate, ahead_ns = (
             np.concatenate(part) for part in zip(*parts, strict=True)
         )
         if isinstance(self._chosen, str):
-            near = self._near(self._topics[self._chosen], ahead_ns)
+            near = self._near(self._streams.topics[self._chosen], ahead_ns)
             stamp_ns, force, rate = stamp_ns[near], force[near], rate[near]
             if not len(stamp_ns):
                 return
@@ -212,8 +239,8 @@ class ImuPoses:
 
     def _choose(self) -> bool:
         """Choose the IMU; False while there are no samples."""
-        numbers = sorted(key for key in self._waiting if isinstance(key, int))
-        topics = sorted(key for key in self._waiting if isinstance(key, str))
+        numbers = sorted(key for key in self._streams.waiting if isinstance(key, int))
+        topics = sorted(key for key in self._streams.waiting if isinstance(key, str))
         for number in numbers:
             sensor = self._sensors[number]
             sensor_from_imu = sensor.lidar.sensor_from_imu()
@@ -221,7 +248,7 @@ class ImuPoses:
                 pose = sensor.body_from_sensor @ sensor_from_imu
                 return self._use(number, pose, f"the IMU of {sensor.name}")
         for topic in topics:
-            frame = self._frame_of[topic].lstrip("/")
+            frame = self._streams.frame_of[topic].lstrip("/")
             if frame not in self._frames:
                 raise RigError(
                     f"--deskew imu: {topic}: expected a static transform to the frame {frame!r}, "
@@ -239,7 +266,7 @@ class ImuPoses:
                 "(FILE.tum)"
             )
         self._chosen = key
-        self._waiting = {key: self._waiting[key]}
+        self._drop_others(key)
         self.name = name
         self._integrator = Integrator(body_from_imu, name)
         return True

@@ -33,6 +33,7 @@ from mlbatch.poses.solve import (
     solve,
 )
 from mlbatch.poses.surfaces import distances, shared_cells
+from mlbatch.poses.turning import ImuRotation
 from mlbatch.units import MM_PER_M, RAD_PER_DEG
 
 # How far a guess may be off; what is found beyond, with some reserve, is no refinement of it.
@@ -124,7 +125,7 @@ class Calibration:
     places: number that the poses were solved on; held_out: number that they were measured on;
     different: places between which the machine moved; windows: of the recording; steps: windows
     whose motion was used (--from-motion); view: a picture, None of poses from motion alone.
-    level: what the IMU of the first lidar says of its pose, or "".
+    level: what the IMU of the first lidar says of its pose, or ""; imus: of the recording.
     """
 
     lidars: tuple[LidarPose, ...]
@@ -136,6 +137,7 @@ class Calibration:
     view: View | None
     steps: int = 0
     level: str = ""
+    imus: tuple[ImuRotation, ...] = ()
 
     def title(self) -> str:
         """What the poses come from, in a line."""
@@ -174,6 +176,16 @@ class Calibration:
         ]
         return [[*head, "apart after mm"], *rows]
 
+    def imu_rows(self) -> list[list[str]]:
+        """The table of IMUs whose rotation is known, empty without any; row 0 is the head."""
+        head = ["imu", "roll, pitch, yaw deg", "+- deg", "off deg", "late ms"]
+        rows = [_imu_row(imu) for imu in self.imus if not imu.refusal]
+        return [head, *rows] if rows else []
+
+    def notes(self) -> list[str]:
+        """What is not known of IMUs, and what the IMU of the first lidar says of its pose."""
+        return [*filter(None, [self.level, *(imu.refusal for imu in self.imus)])]
+
     def as_json(self) -> dict[str, object]:
         """The document of `--json`."""
         return {
@@ -184,6 +196,7 @@ class Calibration:
             "windows": self.windows,
             "steps": self.steps,
             "level": self.level,
+            "imus": [_imu_as_json(imu) for imu in self.imus],
             "lidars": [
                 {
                     "name": lidar.name,
@@ -218,6 +231,44 @@ def _row(lidar: LidarPose, *, has_delay: bool) -> list[str]:
     cells += [f"{lidar.moved_mm:.1f}", f"{lidar.turned_deg:.3f}"]
     cells += [numbers(lidar.sigma_mm.tolist(), 1), numbers(lidar.sigma_deg.tolist(), 3)]
     return [*cells, *([f"{lidar.delay_ms:.2f} +- {lidar.delay_sigma_ms:.2f}"] if has_delay else [])]
+
+
+def _imu_row(imu: ImuRotation) -> list[str]:
+    off = f"{imu.off_deg:.2f}" if np.isfinite(imu.off_deg) else "-"
+    late = "-"
+    if np.isfinite(imu.late_ms):
+        late = f"{imu.late_ms:.1f} +- {imu.late_sigma_ms:.1f}"
+    return [imu.name, _angles(imu.rotation), numbers(imu.sigma_deg.tolist(), 2), off, late]
+
+
+def _angles(rotation: F64Array) -> str:
+    pose = np.eye(4)
+    pose[:3, :3] = rotation
+    return numbers(rpy_deg(pose), 2)
+
+
+def imu_note(imu: ImuRotation) -> str:
+    """An IMU in a comment of a rig."""
+    return (
+        f"{imu.name}: rotation_rpy_deg [{_angles(imu.rotation)}] in the body frame, standard "
+        f"deviations {numbers(imu.sigma_deg.tolist(), 2)} degrees"
+    )
+
+
+def _imu_as_json(imu: ImuRotation) -> dict[str, object]:
+    # JSON has no NaN.
+    late = imu.late_ms, imu.late_sigma_ms
+    late_ms, late_sigma_ms = late if np.isfinite(late).all() else (None, None)
+    known = not imu.refusal
+    return {
+        "name": imu.name,
+        "body_from_imu": imu.rotation.tolist() if known else None,
+        "sigma_deg": imu.sigma_deg.tolist() if known else None,
+        "off_deg": imu.off_deg if np.isfinite(imu.off_deg) else None,
+        "late_ms": late_ms,
+        "late_sigma_ms": late_sigma_ms,
+        "refusal": imu.refusal,
+    }
 
 
 def numbers(values: Sequence[float], digits: int) -> str:

@@ -14,7 +14,7 @@ import numpy as np
 
 from mlbatch.arrays import F64Array, I64Array
 from mlbatch.motion.agreement import Turns
-from mlbatch.motion.se3 import exp_rotation, skew
+from mlbatch.motion.se3 import exp_rotation, log_rotation, skew
 from mlbatch.poses.hand_eye import DOUBT, Noise, known_rows, transformed
 from mlbatch.units import NS_PER_MS, NS_PER_S
 
@@ -35,6 +35,9 @@ _MOST_SIGMA_S = 0.01
 # What odometry adds to its noise: of simulated drives the delay was up to 2.3 ms off.
 _ADDED = np.array([math.radians(0.03)] * 3 + [0.0] * 3 + [0.002]) ** 2
 _PRIOR = np.array([3.0] * 3 + [1.0] * 3 + [1.0]) ** -2
+
+# Slower turns about a second axis, root mean square, do not fix a rotation to 1 degree, rad/s.
+_LEAST_RATE = math.radians(0.5)
 
 _INSTEAD = "drive a figure of eight, and over a kerb, so that it turns about two axes"
 
@@ -96,6 +99,71 @@ def turning(seen: F64Array, middle_ns: I64Array, turns: Turns, name: str) -> Tur
     inverse = np.asarray(np.linalg.inv(fit.normal(state)), np.float64)
     covariance = DOUBT * inverse + np.diag(_ADDED)
     return Turning(*state, covariance, *_words(fit, state, covariance, name))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ImuRotation:
+    """How an IMU lies, by its turns and those of the first lidar.
+
+    rotation: (3, 3), body_from_imu; sigma_deg: (3,), about x, y, z of the body; off_deg: from the
+    rotation that metadata or /tf_static give, NaN without; late_ms, late_sigma_ms: of its stamps,
+    NaN where it turns too evenly; refusal: why none of it is known, or "".
+    """
+
+    name: str
+    rotation: F64Array
+    sigma_deg: F64Array
+    off_deg: float
+    late_ms: float
+    late_sigma_ms: float
+    refusal: str = ""
+
+
+def imu_rotation(
+    seen: F64Array,
+    middle_ns: I64Array,
+    turns: Turns,
+    name: str,
+    body_from_first: F64Array,
+    stated: F64Array | None,
+) -> ImuRotation:
+    """Rotation of an IMU by `turning`; body_from_first, stated (body_from_imu): (3, 3)."""
+    found = turning(seen, middle_ns, turns, name)
+    if found.undetermined:
+        return refused_imu(name, found.undetermined)
+    rotation = np.matmul(body_from_first, found.rotation)
+    covariance = np.matmul(np.matmul(body_from_first, found.covariance[:3, :3]), body_from_first.T)
+    off_deg = late_ms = late_sigma_ms = float("nan")
+    if stated is not None:
+        turn = log_rotation(np.matmul(rotation, stated.T)[None])[0]
+        off_deg = math.degrees(float(np.linalg.norm(turn)))
+    if not found.late_undetermined:
+        late_ms, late_sigma_ms = 1000.0 * found.delay_s, 1000.0 * found.delay_sigma_s
+    sigma_deg = np.degrees(np.sqrt(np.diag(covariance)))
+    return ImuRotation(name, rotation, sigma_deg, off_deg, late_ms, late_sigma_ms)
+
+
+def refused_imu(name: str, reason: str) -> ImuRotation:
+    """An IMU that the motion does not fix."""
+    unknown = np.full(3, np.nan)
+    return ImuRotation(name, np.eye(3), unknown, np.nan, np.nan, np.nan, reason)
+
+
+def turns_too_little(turns: Turns, name: str) -> str:
+    """Why turns by a gyroscope fix no rotation, whatever a lidar sees, or ""."""
+    stamp_ns = np.arange(turns.stamp_ns[0], turns.stamp_ns[-1], 100 * NS_PER_MS)
+    steps = turns.between(stamp_ns[:-1], stamp_ns[1:]) / 0.1
+    if len(steps) < _LEAST_STEPS:
+        return f"{name}: expected samples of 3 s, found fewer; record longer"
+    # Of constant turns a bias is as likely.
+    rates = np.linalg.svd(steps - steps.mean(axis=0), compute_uv=False) / math.sqrt(len(steps))
+    if rates[1] >= _LEAST_RATE:
+        return ""
+    first, second = (math.degrees(rate) for rate in rates[:2].tolist())
+    return (
+        f"{name}: expected turns about two axes by {math.degrees(_LEAST_RATE):.1f} degrees/s, "
+        f"found {first:.1f} and {second:.1f} (root mean square); {_INSTEAD}"
+    )
 
 
 def gyroscope_turns(stamp_ns: I64Array, rate: F64Array) -> Turns:

@@ -6,6 +6,7 @@ import contextlib
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from dataclasses import replace
 from datetime import date
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +20,7 @@ from mlbatch.motion.gravity import standing_gravity, tilt_deg
 from mlbatch.motion.registration import Pose
 from mlbatch.motion.se3 import exp_rotation
 from mlbatch.pipeline.conversion import Conversion, Progress
+from mlbatch.pipeline.deskew import ImuStreams
 from mlbatch.pipeline.job import Job
 from mlbatch.poses.calibration import (
     MOST_OFF_DEG,
@@ -28,13 +30,26 @@ from mlbatch.poses.calibration import (
     Undetermined,
     by_motion,
     calibrated,
+    imu_note,
     motion_poses,
     numbers,
     rounded,
 )
-from mlbatch.poses.from_motion import MotionWindow, contradiction, poses_from_motion
+from mlbatch.poses.from_motion import (
+    MotionPoses,
+    MotionWindow,
+    contradiction,
+    poses_from_motion,
+)
 from mlbatch.poses.places import LEAST_RANGE_M, MOST_RANGE_M, Places, places_of
 from mlbatch.poses.solve import Cloud, State
+from mlbatch.poses.turning import (
+    ImuRotation,
+    gyroscope_turns,
+    imu_rotation,
+    refused_imu,
+    turns_too_little,
+)
 from mlbatch.python.options import Moment, Names, Paths, session_job, window_job
 from mlbatch.rig.rig import Rig, RigSensor, UnknownExtrinsics, read_rig
 from mlbatch.rig.write import write_rig
@@ -44,6 +59,8 @@ from mlbatch.writers import check_name
 
 # Windows in which a machine moves evenly, Hz.
 _RATE = 10
+# Windows that turns of an IMU are compared in, where motion is not measured anyway.
+_MOST_IMU_WINDOWS = 600
 # The ground is rarely more level.
 _LEVEL_DEG = 2.0
 
@@ -109,6 +126,8 @@ def calibrate(
             "--align-clocks, which aligns them anew in each run; leave one out"
         )
     run = Conversion(job)
+    streams = ImuStreams(run.sensors)
+    run.imu_users.append(streams)
     names = [sensor.name for sensor in run.sensors]
     if len(names) < 2:
         raise UsageError(
@@ -116,10 +135,42 @@ def calibrate(
             "of all, and a rig with all of them"
         )
     level = _level(run.session.setup, names[0])
-    found = _calibrated(
+    found, motion = _calibrated(
         run, names, time_offset=time_offset, from_motion=from_motion, progress=progress
     )
-    return replace(found, level=level)
+    return replace(found, level=level, imus=tuple(_imus(run, streams, found, motion, progress)))
+
+
+def _imus(
+    run: Conversion,
+    streams: ImuStreams,
+    found: Calibration,
+    motion: MotionPoses | None,
+    progress: Progress | None,
+) -> Iterator[ImuRotation]:
+    """How the IMUs of a recording lie; motion: of the lidars, measured here where it is None."""
+    frames = run.session.setup.frames()
+    for key, stamp_ns, rate in streams.rates():
+        turns = gyroscope_turns(stamp_ns, rate)
+        stated: F64Array | None
+        if isinstance(key, int):
+            name = f"the IMU of {run.sensors[key].name}"
+            stated = run.sensors[key].lidar.sensor_from_imu()
+            if stated is not None:
+                stated = compose(found.lidars[key].body_from_sensor, stated)
+        else:
+            name, stated = key, frames.get(streams.frame_of[key].lstrip("/"))
+        if refusal := turns_too_little(turns, name):
+            yield refused_imu(name, refusal)
+            continue
+        if motion is None:
+            poses = [run.session.setup.sensors[0].pose.body_from_sensor]
+            with contextlib.closing(_scans(Conversion(run.job), progress)) as scans:
+                windows = _motion_windows(islice(scans, _MOST_IMU_WINDOWS), poses)
+                motion = poses_from_motion(windows, [found.lidars[0].name])
+        seen, first = motion.twist[0, :, 3:], found.lidars[0].body_from_sensor[:3, :3]
+        known = None if stated is None else stated[:3, :3]
+        yield imu_rotation(seen, motion.middle_ns, turns, name, first, known)
 
 
 def _level(setup: Discovery, first: str) -> str:
@@ -149,11 +200,11 @@ def _calibrated(
     time_offset: bool,
     from_motion: bool,
     progress: Progress | None,
-) -> Calibration:
+) -> tuple[Calibration, MotionPoses | None]:
     job = run.job
     poses = [sensor.pose.body_from_sensor for sensor in run.session.setup.sensors]
     if not from_motion:
-        return calibrated(_places(run, progress), names, poses, delays=time_offset)
+        return calibrated(_places(run, progress), names, poses, delays=time_offset), None
     with contextlib.closing(_scans(run, progress)) as scans:
         motion = poses_from_motion(_motion_windows(scans, poses), names)
     if motion.refusal:
@@ -177,12 +228,12 @@ def _calibrated(
                 "calibrate: expected surfaces in common or motion that fix the poses, found "
                 f"neither: {'; '.join(word for word, _, _ in words)}; {words[-1][2]}"
             ) from err
-        return by_motion(names, moved, motion, places.windows)
+        return by_motion(names, moved, motion, places.windows), motion
     back = inverse(found.lidars[0].body_from_sensor)
     refined = [compose(back, lidar.body_from_sensor) for lidar in found.lidars]
     if wrong := contradiction(motion, [Pose(own[:3, :3], own[:3, 3]) for own in refined], names):
         raise RecordingError(f"calibrate: {wrong}")
-    return found
+    return found, motion
 
 
 def _places(run: Conversion, progress: Progress | None) -> Places:
@@ -234,6 +285,9 @@ def rig_text(job: Job, found: Calibration, folder: Path, on: date) -> str:
         f"deviations {_deviations(lidar)} (x, y, z of the body)"
         for lidar in found.lidars
     }
+    notes[found.lidars[0].name] += "".join(
+        f"; {imu_note(imu)}" for imu in found.imus if not imu.refusal
+    )
     refined: Rig = replace(rig, sensors=tuple(sensors))
     return write_rig(refined, folder, notes)
 

@@ -216,9 +216,11 @@ def test_motion_needs_no_guess(tmp_path: Path) -> None:
     # Thirty windows of motion are needed.
     head, sway = MOTION.split("  sway:")
     motion = f"{head}    - [5, -0.8, 0.2, 1.2, 320]\n  sway:{sway}"
-    drive = record(tmp_path, scenario_text(SENSORS, motion=motion, duration=4.5))
+    sensors = SENSORS.replace("OS0-32", "OS0-32, imu: {gyro_bias: [0.01, -0.02, 0.03]}", 1)
+    drive = record(tmp_path, scenario_text(sensors, motion=motion, duration=4.5))
     rig = tmp_path / "rig.yaml"
-    left, right = mlbatch.calibrate(drive.path, _unknown(drive.rig), rig, from_motion=True).lidars
+    found = mlbatch.calibrate(drive.path, _unknown(drive.rig), rig, from_motion=True)
+    left, right = found.lidars
     true = read_rig(drive.rig)
     relative = compose(inverse(true_pose(true, "left")), true_pose(true, "right"))
     error_mm, error_deg = off(right, relative)
@@ -226,6 +228,12 @@ def test_motion_needs_no_guess(tmp_path: Path) -> None:
     assert np.abs(error_mm).max() < 5
     assert np.abs(error_deg).max() < 0.05
     assert true_pose(read_rig(rig), "right").tobytes() == right.body_from_sensor.tobytes()
+    # The axes of the IMU of an Ouster are those of its sensor frame.
+    (imu,) = found.imus
+    imu_error_deg = np.rad2deg(log_rotation(imu.rotation[None])[0])
+    assert not imu.refusal
+    assert (np.abs(imu_error_deg) < np.minimum(4 * imu.sigma_deg, 2.0)).all()
+    assert "; the IMU of left: rotation_rpy_deg [" in rig.read_text(encoding="utf-8")
 
 
 def test_too_little_motion_gives_no_pose(room: Recorded) -> None:

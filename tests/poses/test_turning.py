@@ -10,7 +10,7 @@ import pytest
 from mlbatch.arrays import F64Array, I64Array
 from mlbatch.motion.agreement import Turns
 from mlbatch.motion.se3 import exp_rotation, log_rotation
-from mlbatch.poses.turning import gyroscope_turns, lidar_turns, turning
+from mlbatch.poses.turning import gyroscope_turns, lidar_turns, turning, turns_too_little
 from mlbatch.units import NS_PER_S
 
 MIDDLE_NS = np.arange(200, dtype=np.int64) * 100_000_000 + 2_000_000_000
@@ -59,6 +59,18 @@ def test_turns_about_one_axis_leave_the_rotation_about_it() -> None:
     assert "turn about (0.00, 0.00, 1.00)" in found.undetermined.replace("-", "")
     assert not found.late_undetermined
     assert found.delay_s == pytest.approx(0.02, abs=2e-3)
+
+
+@pytest.mark.parametrize(
+    ("axes", "slower", "is_enough"), [(2, 1, True), (2, 30, False), (1, 1, False)]
+)
+def test_a_gyroscope_alone_says_that_it_turns_too_little(
+    axes: int, slower: int, is_enough: bool
+) -> None:
+    """Turns about z by 26 degrees/s and about x by 7, root mean square, or a part of these."""
+    _, felt = seen_and_felt(axes, np.eye(3), 0)
+    found = turns_too_little(Turns(felt.stamp_ns, felt.total / slower), "imu")
+    assert found == "" if is_enough else "imu: expected turns about two axes by 0.5" in found
 
 
 def test_a_machine_that_does_not_turn_is_refused() -> None:
