@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 
     from mlbatch.discovery.types import Note
     from mlbatch.outputs.scan import Scan
+    from mlbatch.pipeline.job import Job
 
 # Of `convert`: what selects lidars, times and points.
 OPTIONS = (
@@ -49,12 +50,13 @@ def view(
     from mlbatch.page.view_server import ViewServer
     from mlbatch.pipeline.interrupts import interruptible
 
-    begin, total = _source(sources, values)
+    begin, total, job = _source(sources, values)
     title = ", ".join(path.name or str(path) for path in sources)
     with interruptible():
         scans = ViewScans(begin, _print_error)
         try:
-            with ViewServer(title, scans, total, port) as server:
+            expected = None if job is None else _expected(job, scans.first)
+            with ViewServer(title, scans, total, port, expected) as server:
                 typer.echo(f"{server.url} shows {one_line(title)}; Ctrl-C ends")
                 sys.stdout.flush()
                 if not no_browser and _has_screen():
@@ -76,8 +78,8 @@ with_parameters(view, (parameter(options.BY_NAME[name]) for name in OPTIONS))
 
 def _source(
     paths: list[Path], values: dict[str, Any]
-) -> tuple[Callable[[], Iterator[Scan]], int | None]:
-    """What begins to give scans, and their number if it is known."""
+) -> tuple[Callable[[], Iterator[Scan]], int | None, Job | None]:
+    """What begins to give scans, their number if it is known, and the job of recordings."""
     from mlbatch.outputs.read import read
     from mlbatch.outputs.run_files import RunFiles, is_output
 
@@ -89,7 +91,8 @@ def _source(
                     f"output {paths[0]}, which is shown as it is; leave it out"
                 )
         table = RunFiles.of(paths[0]).texts()[1]
-        return lambda: read(paths[0], by_window=True), None if table is None else _windows_of(table)
+        total = None if table is None else _windows_of(table)
+        return lambda: read(paths[0], by_window=True), total, None
     from mlbatch.cli.values import job_of
     from mlbatch.python.recording import scans_of
 
@@ -104,7 +107,23 @@ def _source(
             typer.echo(one_line(f"mlbatch: warning: {note.code}: {note.message}"), err=True)
         said.add(note)
 
-    return lambda: scans_of(job, warn), None
+    return lambda: scans_of(job, warn), None, job
+
+
+def _expected(job: Job, first: Scan) -> int | None:
+    """About how many scans recordings have, by their ends; None where only reading shows them."""
+    from mlbatch.pipeline.contents import recording_report
+    from mlbatch.readers import open_recordings
+    from mlbatch.types import StreamTable
+    from mlbatch.units import NS_PER_S, parse_rate
+
+    opened = open_recordings(job.recordings, StreamTable(), job.selection.rig)
+    lasts_ns = [recording_report(one).last_host_ns for one in opened]
+    known_ns = [last_ns for last_ns in lasts_ns if last_ns is not None]
+    if len(known_ns) < len(lasts_ns) or not first.ready_host_ns:
+        return None
+    periods = (max(known_ns) - first.ready_host_ns) * parse_rate(first.rate_hz) / NS_PER_S
+    return 1 + max(0, round(periods))
 
 
 def _windows_of(table: str) -> int:

@@ -78,9 +78,9 @@ function startPlayer(data, load, last) {
       say(err.message);
     }
     if (chosen !== number) return true;
+    slider.max = last();
     if (!cloud) { chosen = before; return false; }
     viewer.show(cloud, colouring);
-    slider.max = last();
     slider.value = number;
     slider.setAttribute("aria-valuetext", cloud.title);
     byId("cloudinfo").textContent = cloud.title + ": " + cloud.text;
@@ -118,7 +118,11 @@ function startPlayer(data, load, last) {
     play.textContent = "Pause";
     playing = setTimeout(step, 0);
   };
-  const choose = (number) => { stop(); show(Math.max(0, number)); };
+  const choose = async (number) => {
+    stop();
+    // After the last scan the last one, once it is known which that is.
+    if (!await show(Math.max(0, number)) && last() < number) show(last());
+  };
   const colour = (name) => { colouring = name; show(chosen); };
   document.querySelectorAll("[data-colour]").forEach((button) => {
     button.addEventListener("click", () => colour(button.dataset.colour));
@@ -126,7 +130,12 @@ function startPlayer(data, load, last) {
   document.querySelectorAll("[data-scan]").forEach((button) => {
     button.addEventListener("click", () => choose(Number(button.dataset.scan)));
   });
-  slider.addEventListener("input", () => choose(Number(slider.value)));
+  // Scans that are made on demand are not made for each step of the slider.
+  let sliding = null;
+  slider.addEventListener("input", () => {
+    clearTimeout(sliding);
+    sliding = setTimeout(() => choose(Number(slider.value)), data.is_played ? 150 : 0);
+  });
   play.addEventListener("click", toggle);
   byId("fit").addEventListener("click", viewer.fit);
   if (byId("spot")) {

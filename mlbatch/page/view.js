@@ -1,7 +1,7 @@
 // Scans from the server that gave the page, see view_server.py.
 (function () {
   const data = JSON.parse(document.getElementById("data").textContent);
-  // Number of scans: all if known, else those loaded.
+  // Number of scans: all if known, else those expected, or loaded.
   let total = data.total, loaded = 0;
 
   // A response: bytes of the header (32 bits, little-endian), the header as JSON, deflated points.
@@ -21,7 +21,7 @@
     return unpackCloud({ ...head, data: bytes.subarray(4 + size) });
   }
 
-  const draw = startPlayer(data, load, () => Math.max(total || 0, loaded) - 1);
+  const draw = startPlayer(data, load, () => Math.max(total || data.expected, loaded) - 1);
   matchMedia("(prefers-color-scheme: dark)").addEventListener("change", draw);
   document.documentElement.dataset.drawn = Math.round(performance.now());
 })();

@@ -18,8 +18,6 @@ from mlbatch.units import NS_PER_S
 
 # Scans to go back to without a new start.
 MOST_KEPT = 16
-# Of deflate: on one machine, size matters less than time.
-_LEVEL = 1
 # A scan that is being made is waited for, at the end.
 _LAST_S = 5.0
 
@@ -133,7 +131,7 @@ def _packed(parts: list[Scan], number: int, first_ns: int) -> bytes:
     stored = [_stored(scan) for scan in parts]
     window_ns = first.end_ns - first.start_ns
     # All columns are shown, whatever their number.
-    cloud = joined_cloud(place, stored, window_ns, np.ones(1, np.int64), level=_LEVEL)
+    cloud = joined_cloud(place, stored, window_ns, np.ones(1, np.int64), is_fast=True)
     return _answer(cloud_data(cloud, (first.start_ns - first_ns) / NS_PER_S), cloud.packed)
 
 

@@ -32,10 +32,17 @@ class ViewServer(ThreadingHTTPServer):
 
     daemon_threads = True
 
-    def __init__(self, title: str, scans: ViewScans, total: int | None, port: int = 0) -> None:
-        """total: number of scans, None if unknown."""
+    def __init__(
+        self,
+        title: str,
+        scans: ViewScans,
+        total: int | None,
+        port: int = 0,
+        expected: int | None = None,
+    ) -> None:
+        """total: number of scans, None if unknown; expected: about as many, for the slider."""
         self.scans = scans
-        self.page = _page(title, scans.first, total)
+        self.page = _page(title, scans.first, total, expected)
         try:
             super().__init__((LOOPBACK, port), _Handler)
         except (OSError, OverflowError) as err:
@@ -88,7 +95,7 @@ class _Handler(BaseHTTPRequestHandler):
         """Print nothing of requests."""
 
 
-def _page(title: str, first: Scan, total: int | None) -> bytes:
+def _page(title: str, first: Scan, total: int | None, expected: int | None) -> bytes:
     names = {"lidar": "lidar_id", "time": "time_ns", "intensity": "intensity"}
     poses = [sensor.body_from_sensor for sensor in first.info.sensors]
     data = {
@@ -102,6 +109,7 @@ def _page(title: str, first: Scan, total: int | None) -> bytes:
         "is_played": True,
         "play_ms": float(1000 / (parse_rate(first.rate_hz) * first.slices)),
         "total": total,
+        "expected": expected or 0,
     }
     text = render(
         "view.html",

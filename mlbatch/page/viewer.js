@@ -163,12 +163,18 @@ function glPainter(canvas, isFast) {
 
 // Draw on the processor: the nearest point of a pixel is seen.
 function plainPainter(canvas) {
-  const ctx = canvas.getContext("2d");
+  // Kept in memory, where it is drawn.
+  const ctx = canvas.getContext("2d", { willReadFrequently: true });
+  let image = null, pixels = null, depths = null;
   return (cloud, colours, camera) => {
     const width = canvas.width, height = canvas.height;
-    const image = ctx.createImageData(width, height);
-    const pixels = new Uint32Array(image.data.buffer).fill(word(...rgbOf(color("cloud"))));
-    const depths = new Float32Array(width * height).fill(Infinity);
+    if (!image || image.width !== width || image.height !== height) {
+      image = ctx.createImageData(width, height);
+      pixels = new Uint32Array(image.data.buffer);
+      depths = new Float32Array(width * height);
+    }
+    pixels.fill(word(...rgbOf(color("cloud"))));
+    depths.fill(Infinity);
     const big = Math.round(1.5 * (window.devicePixelRatio || 1));
     camera.project(cloud, width, height, (i, px, py, depth) => {
       for (let y = Math.round(py); y < py + big; y++) {
@@ -311,9 +317,10 @@ function makeViewer(canvas, names, poses, say, isPlayed, spot) {
       base.addEventListener("webglcontextlost", () => { begin(false); draw(); });
       return;
     }
-    // A canvas that was asked for WebGL gives nothing else.
-    if (withGl) { begin(false); return; }
-    paint = plainPainter(base);
+    // One canvas: without a graphics processor browsers take as long to lay two over each other as
+    // to draw the points.
+    base.remove();
+    paint = plainPainter(canvas);
     say("This browser offers no WebGL" + (isPlayed ? " with a graphics processor" : "") +
       ", so the points are drawn on the processor: slower, and without fading by distance.");
   }
@@ -322,8 +329,7 @@ function makeViewer(canvas, names, poses, say, isPlayed, spot) {
     pending = false;
     const { ctx, width, height } = prepared(canvas);
     if (!cloud || !width || !height) return;
-    base.width = canvas.width;
-    base.height = canvas.height;
+    [base.width, base.height] = [canvas.width, canvas.height];
     camera.aspect = width / height;
     colours = colours || colorsOf(cloud, colouring);
     paint(cloud, colours, camera);

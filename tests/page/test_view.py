@@ -6,6 +6,7 @@ import base64
 import contextlib
 import http.client
 import json
+import re
 import signal
 import socket
 import subprocess
@@ -46,8 +47,10 @@ OUTPUTS = {
 
 
 @contextlib.contextmanager
-def served(scans: ViewScans, total: int | None = None) -> Iterator[ViewServer]:
-    with ViewServer("drive <b>", scans, total) as server:
+def served(
+    scans: ViewScans, total: int | None = None, expected: int | None = None
+) -> Iterator[ViewServer]:
+    with ViewServer("drive <b>", scans, total, expected=expected) as server:
         thread = threading.Thread(target=server.serve_forever, args=[0.01])
         thread.start()
         try:
@@ -252,6 +255,11 @@ def test_ctrl_c_ends(number: signal.Signals, tmp_path: Path) -> None:
         assert process.stdout is not None
         line = process.stdout.readline()
         assert line.endswith(" shows two_lidars.pcap; Ctrl-C ends\n")
+        with urllib.request.urlopen(line.split()[0]) as answer:
+            # For the slider, before the end is known.
+            found = re.search(rb'"total":null,"expected":(\d+)', answer.read())
+            assert found is not None
+            assert abs(int(found[1]) - SCANS) <= 1
         with urllib.request.urlopen(f"{line.split()[0]}scans/6") as answer:
             assert header_of(answer.read())["title"] == "Scan 6, +0.6 s"
         process.send_signal(number)
@@ -301,11 +309,20 @@ def test_in_a_browser(tmp_path: Path) -> None:
     shown = "document.documentElement.dataset.shown"
     click = "document.getElementById('play').click()"
     why = "document.getElementById('cloudwhy').textContent"
+    slide = (
+        "(() => {{ const s = document.getElementById('scan'); s.value = {0}; "
+        "s.dispatchEvent(new Event('input')); return s.value; }})()"
+    )
     with browser(tmp_path / "profile") as tab:
         begin = lambda: mlbatch.scans(CAPTURE, rig=RIG)  # noqa: E731
-        with served(ViewScans(begin, pytest.fail)) as server:
+        with served(ViewScans(begin, pytest.fail), expected=20) as server:
             tab.open(server.url)
             wait_for(tab, shown, "0")
+            # Scans that are not loaded; those that do not exist are the last.
+            for number, last in (("4", "4"), ("15", "6"), ("0", "0")):
+                assert tab.run(slide.format(number)) == number
+                wait_for(tab, shown, last)
+            assert tab.run("document.getElementById('scan').max") == "6"
             tab.run(click)
             # All scans, and the first again.
             for number in ("3", "6", "0"):
