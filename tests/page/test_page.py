@@ -160,7 +160,7 @@ def test_large_scans_are_thinned_by_whole_columns(
 ) -> None:
     assert shell(f"convert {FIX} -o scans --quiet").code == 0
     # Two scans (one is first and has the fewest points) in room for one.
-    monkeypatch.setattr("mlbatch.page.clouds._MOST_CHARS", 60_000)
+    monkeypatch.setattr("mlbatch.page.clouds.MOST_CHARS", 60_000)
     assert shell("report scans -o page.html").code == 0
     text = Path("page.html").read_text(encoding="utf-8")
     clouds = plot_data(Path("page.html"))["clouds"]
@@ -183,7 +183,7 @@ def test_a_page_is_full_but_not_beyond(shell: Shell, monkeypatch: pytest.MonkeyP
     (one, *_) = read_clouds(Path("scans"), choose_places(windows, 1), windows)
     for room in (3, 4, 5):
         limit = int((room + 0.9) * one.chars)
-        monkeypatch.setattr("mlbatch.page.clouds._MOST_CHARS", limit)
+        monkeypatch.setattr("mlbatch.page.clouds.MOST_CHARS", limit)
         clouds = chosen_clouds(Path("scans"), windows, None)
         rows = [cloud.place.row for cloud in clouds]
         assert rows == sorted(set(rows))
@@ -201,7 +201,7 @@ def test_empty_scans_promise_no_room(shell: Shell, monkeypatch: pytest.MonkeyPat
     assert windows is not None
     (one,) = read_clouds(Path("scans"), choose_places(windows, 7)[1:2], windows)
     assert one.total == POINTS
-    monkeypatch.setattr("mlbatch.page.clouds._MOST_CHARS", 3 * one.chars)
+    monkeypatch.setattr("mlbatch.page.clouds.MOST_CHARS", 3 * one.chars)
     clouds = chosen_clouds(Path("scans"), windows, None)
     assert 0 < clouds[0].total < 1000
     assert sum(cloud.chars for cloud in clouds) <= 3 * one.chars
