@@ -66,7 +66,8 @@ def read_sweep(path: Path, sweeps: Sweeps, stamp_ns: int) -> bytes:
 
 def first_ns(path: Path, sweeps: Sweeps, rule: PointRule) -> int:
     """The earliest time of the points of a file, which count from 1970 in the unit of the rule."""
-    columns = _columns(path, sweeps)
+    times = tuple(pair for pair in sweeps.arrays if pair[0] == rule.time)
+    columns = _columns(path, sweeps._replace(arrays=times or sweeps.arrays))
     name = rule.time or next((name for name in TIME_NAMES if name in columns), "")
     if name not in columns or not rule.unit_ns:
         raise SweepError(
@@ -140,7 +141,7 @@ def _named(fields: Sequence[tuple[str, str]], rows: _Array) -> _Columns:
 
 def _of_arrays(path: Path, data: bytes, sweeps: Sweeps) -> _Columns:
     """An array for each field of the points of a .npy or .npz file."""
-    arrays = _arrays(path, data)
+    arrays = _arrays(path, data, [name for _, name in sweeps.arrays])
     if "" not in arrays:
         named = dict(sweeps.arrays) or {name: name for name in arrays}
         return {field: _column(path, arrays, name) for field, name in named.items()}
@@ -161,8 +162,12 @@ def _of_arrays(path: Path, data: bytes, sweeps: Sweeps) -> _Columns:
     return {name: array[:, at] for at, (name, kind) in enumerate(sweeps.fields) if kind[0] != "V"}
 
 
-def _arrays(path: Path, data: bytes) -> Mapping[str, _Array]:
-    """Arrays of a .npz file by name, or that of a .npy file as ""; pickles are not read."""
+def _arrays(path: Path, data: bytes, names: Sequence[str]) -> Mapping[str, _Array]:
+    """Arrays of a .npz file by name, or that of a .npy file as ""; pickles are not read.
+
+    names: those that are needed, or columns of them; none: all.
+    """
+    needed = {*names, *(name.rpartition(".")[0] for name in names)}
     try:
         if data.startswith(_NPY_HEAD):
             return {"": np.load(io.BytesIO(data), allow_pickle=False)}
@@ -171,7 +176,8 @@ def _arrays(path: Path, data: bytes) -> Mapping[str, _Array]:
         if size > MOST_BYTES:
             raise ValueError(f"{size} bytes of arrays, more than {MOST_BYTES}")
         with np.load(io.BytesIO(data), allow_pickle=False) as file:
-            return dict(file)
+            # Shown in an error where none of them is there.
+            return {name: file[name] for name in needed & {*file} or file}
     except Exception as err:
         # Damaged headers and archives end in errors of many kinds.
         reason = (str(err).splitlines() or [type(err).__name__])[0]

@@ -117,25 +117,30 @@ def _batch(messages: list[Message]) -> PacketBatch:
     return PacketBatch(np.zeros(0, np.uint8), _NONE, _NONE, _NONE, _NONE, tuple(messages))
 
 
-def sweep_paths(folder: Path, glob: str) -> list[Path]:
-    """The files of a pattern in a folder, by name."""
-    return sorted(path for path in folder.glob(_STAMP.sub("*", glob)) if path.is_file())
-
-
 def _files(folder: Path, sweeps: Sweeps, rule: PointRule) -> list[_SweepFile]:
     """The files of a sensor in the order of their times; RecordingError where these are unclear."""
     topic = Topic(sweeps.glob, CLOUD_TYPE, "ros1")
     found: dict[int, _SweepFile] = {}
-    name = _name_pattern(sweeps.glob)
-    unit_ns = stamp_ns = 0
-    for path in sweep_paths(folder, sweeps.glob):
-        own_unit_ns = 1
-        if "{stamp" not in sweeps.glob and rule.origin == ABSOLUTE and not _is_time(path.stem):
-            # What is not read is counted when its turn comes.
-            stamp_ns = _first_ns(path, sweeps, rule) or stamp_ns + 1
-        else:
-            text = path.relative_to(folder).as_posix()
-            stamp_ns, own_unit_ns = _stamp_ns(text, name, path, sweeps)
+    undated: list[Path] = []
+    pattern = _name_pattern(sweeps.glob)
+    unit_ns = 0
+    for path in sorted(folder.glob(_STAMP.sub("*", sweeps.glob))):
+        if not path.is_file():
+            continue
+        match = pattern.fullmatch(path.relative_to(folder).as_posix())
+        stamp_ns, own_unit_ns = _stamp_ns(match["stamp"] if match else "", sweeps.glob)
+        if not stamp_ns and rule.origin == ABSOLUTE and "{stamp" not in sweeps.glob:
+            stamp_ns, own_unit_ns = _first_ns(path, sweeps, rule), 1
+            if not stamp_ns:
+                undated.append(path)
+                continue
+        if not 0 < stamp_ns < _LATEST_NS:
+            raise RecordingError(
+                f"{path}: expected the time of the sweep as its name (10 digits of s since 1970, "
+                "13 of ms, 16 of us, 19 of ns, or s with decimals), found "
+                f"{(match['stamp'] if match else path.name)!r}; rename the files by the dataset's "
+                f"list of times, or correct the pattern {sweeps.glob} ({sweeps.place})"
+            )
         if unit_ns not in (0, own_unit_ns):
             raise RecordingError(
                 f"{path}: expected a time with the digits of {next(iter(found.values())).path.name}"
@@ -148,8 +153,12 @@ def _files(folder: Path, sweeps: Sweeps, rule: PointRule) -> list[_SweepFile]:
                 f"{path}: expected each time once, found that of {other.path} again; give each "
                 f"lidar a sensor with a pattern of its own ({sweeps.place})"
             )
+        found[stamp_ns] = _SweepFile(stamp_ns, path, topic, sweeps, path.stat().st_size)
+    # What cannot be read, and files without points, are counted when their turn comes.
+    first_ns = min(found, default=len(undated) + 1)
+    for back, path in enumerate(undated, 1):
         size = path.stat().st_size
-        found[stamp_ns] = _SweepFile(stamp_ns, path, topic, sweeps, size)
+        found[first_ns - back] = _SweepFile(first_ns - back, path, topic, sweeps, size)
     files = sorted(found.values(), key=lambda file: file.stamp_ns)
     _check_first(files)
     return files
@@ -185,36 +194,25 @@ def _first_ns(path: Path, sweeps: Sweeps, rule: PointRule) -> int:
         return 0
 
 
-def _name_pattern(glob: str) -> re.Pattern[str] | None:
-    """Names of files that a pattern describes, with the time as a group; None: it is the stem."""
+def _name_pattern(glob: str) -> re.Pattern[str]:
+    """Names of files that a pattern describes, with the time as a group: without one, the stem."""
     if "{stamp" not in glob:
-        return None
-    parts = re.split(r"(\{stamp[^}]*\}|\*\*/|\*|\?|\[[^]]*\])", glob)
+        return re.compile(r"(?:.*/)?(?P<stamp>[^/]*?)(?:\.[^./]*)?", re.DOTALL)
     words = {"**/": "(?:.*/)?", "*": "[^/]*?", "?": "[^/]"}
-    return re.compile(
-        "".join(
-            rf"(?<!\d)(?P<stamp>{_ISO}|\d{{10}}[._]\d{{1,9}}|\d+)"
-            if part.startswith("{")
-            else words.get(part, part.replace("[!", "[^") if part[:1] == "[" else re.escape(part))
-            for part in parts
-        ),
-        re.DOTALL,
-    )
+    parts = []
+    for part in re.split(r"(\{stamp[^}]*\}|\*\*/|\*|\?|\[[^]]*\])", glob):
+        if part.startswith("{"):
+            parts.append(rf"(?<!\d)(?P<stamp>{_ISO}|\d{{10}}[._]\d{{1,9}}|\d+)")
+        elif part.startswith("["):
+            parts.append(part.replace("[!", "[^"))
+        else:
+            parts.append(words.get(part, re.escape(part)))
+    return re.compile("".join(parts), re.DOTALL)
 
 
-def _is_time(text: str) -> bool:
-    is_whole = _WHOLE.fullmatch(text) is not None and len(text) in _UNITS_NS
-    return is_whole or _SECONDS.fullmatch(text) is not None
-
-
-def _stamp_ns(
-    name: str, pattern: re.Pattern[str] | None, path: Path, sweeps: Sweeps
-) -> tuple[int, int]:
-    """The time in the name of a file, and the unit of its digits, ns."""
-    text = path.stem
-    if pattern is not None and (found := pattern.fullmatch(name)):
-        text = found["stamp"]
-    given = _STAMP.search(sweeps.glob)
+def _stamp_ns(text: str, glob: str) -> tuple[int, int]:
+    """The time of a name, and the unit of its digits, ns; 0 where it is none."""
+    given = _STAMP.search(glob)
     unit = given[1] if given else None
     if unit == "iso" and re.fullmatch(_ISO, text):
         whole_s = round(datetime.fromisoformat(f"{text[:19]}+00:00").timestamp())
@@ -222,18 +220,8 @@ def _stamp_ns(
     seconds = _SECONDS.fullmatch(text)
     if seconds and unit in ("s", None):
         whole, decimals = seconds.groups()
-        stamp_ns = int(whole) * NS_PER_S + int(decimals.ljust(9, "0"))
-        unit_ns = NS_PER_S
-    else:
-        is_whole = _WHOLE.fullmatch(text) is not None
-        unit_ns = (
-            (UNITS_NS.get(unit, 0) if unit else _UNITS_NS.get(len(text), 0)) if is_whole else 0
-        )
-        stamp_ns = int(text) * unit_ns if unit_ns else 0
-    if not 0 < stamp_ns < _LATEST_NS:
-        raise RecordingError(
-            f"{path}: expected the time of the sweep as its name (10 digits of s since 1970, 13 "
-            f"of ms, 16 of us, 19 of ns, or s with decimals), found {text!r}; rename the files by "
-            f"the dataset's list of times, or correct the pattern {sweeps.glob} ({sweeps.place})"
-        )
-    return stamp_ns, unit_ns
+        return int(whole) * NS_PER_S + int(decimals.ljust(9, "0")), NS_PER_S
+    if not _WHOLE.fullmatch(text):
+        return 0, 0
+    unit_ns = UNITS_NS.get(unit, 0) if unit else _UNITS_NS.get(len(text), 0)
+    return int(text) * unit_ns, unit_ns

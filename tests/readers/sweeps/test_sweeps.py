@@ -234,6 +234,20 @@ def test_a_file_cut_off_is_counted_and_named(shell: Shell) -> None:
     assert f"found {size}; correct `dtype`, or copy the file again" in outcome.err
 
 
+def test_files_without_a_time_of_any_kind_are_counted(shell: Shell) -> None:
+    """The first by name is damaged, the second has no points."""
+    files, points = FORMS["npz"]
+    none = {name: array[:0] for name, array in XYZ.items()}
+    others = {"a.npz": files["view_0.npz"][:-40], "b.npz": _saved(**none, us=np.zeros(0, "i8"))}
+    write_sweeps(Path("drive/top"), {**others, **files})
+    outcome = _run(shell, points)
+    assert outcome.code == 0, outcome.err
+    assert _columns() == EXPECTED
+    capture = json.loads(Path("out/report.json").read_text())["capture"]
+    assert capture["skipped"] == {"truncated": 1}
+    assert "a.npz: expected arrays of numbers" in outcome.err
+
+
 @pytest.mark.parametrize("points", [GLOB, f"{{glob: 'a/{{stamp:us}}.npz', {ARRAYS}}}"])
 def test_a_rig_with_sweeps_is_written_as_it_was_read(tmp_path: Path, points: str) -> None:
     file = tmp_path / "rig.yaml"
