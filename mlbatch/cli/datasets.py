@@ -9,8 +9,6 @@ import typer
 
 from mlbatch.cli.parameters import AsJson
 
-HEAD = ("name", "lidars", "data", "size", "licence", "recipe")
-
 
 def datasets(
     name: Annotated[
@@ -27,21 +25,13 @@ def datasets(
         return
     found = {one: recipe(one) for one in ([name] if name else recipe_names())}
     if as_json:
-        rows = [{"name": one, **dataset._asdict()} for one, dataset in found.items()]
-        typer.echo(json.dumps(rows, indent=1))
+        every = [{"name": one, **facts._asdict()} for one, facts in found.items()]
+        typer.echo(json.dumps(every, indent=1))
         return
     from mlbatch.cli.tables import table_lines
 
-    cells = [
-        [
-            one,
-            data.lidars,
-            data.data,
-            data.size,
-            data.licence,
-            (data.refused and "refused") or data.mark,
-        ]
-        for one, data in found.items()
-    ]
-    for line in table_lines([list(HEAD), *cells]):
+    rows = [["name", "lidars", "data", "size", "licence", "recipe"]]
+    for one, facts in found.items():
+        rows.append([one, *facts[2:6], "refused" if facts.refused else facts.mark])
+    for line in table_lines(rows):
         typer.echo(line)

@@ -205,17 +205,6 @@ def _as_in_python(name: str) -> str:
     return name
 
 
-def _rig_of(options: SessionOptions, shown: Callable[[str], str]) -> Path | None:
-    rig = path_of("rig", options.get("rig"))
-    dataset = options.get("dataset")
-    if dataset is None:
-        return rig
-    # Few runs have it.
-    from mlbatch.rig.recipes import rig_of
-
-    return rig_of(rig, dataset, shown("dataset"))
-
-
 def session_job(
     recordings: Paths | tuple[Paths, ...],
     options: SessionOptions,
@@ -228,10 +217,16 @@ def session_job(
     clock = choice(shown("clock"), options.get("clock", "sensor"), CLOCKS)
     align_to = choice(shown("align_to"), options.get("align_to", "host"), ALIGN_TO)
     aligned = options.get("align_clocks", False)
+    rig = path_of("rig", options.get("rig"))
+    if options.get("dataset") is not None:
+        # Few runs have it.
+        from mlbatch.rig.recipes import rig_of
+
+        rig = rig_of(rig, options["dataset"], shown("dataset"))
     return Job(
         recordings=recordings_of(recordings),
         selection=SensorSelection(
-            rig=_rig_of(options, shown),
+            rig=rig,
             metadata=paths_of("metadata", options.get("metadata", ())),
             only=names_of(options.get("only", ())),
             ignore=names_of(options.get("ignore", ())),

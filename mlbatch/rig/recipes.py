@@ -107,9 +107,6 @@ def recipe_path(name: str, option: str = "--dataset") -> Path:
         plain = {re.sub(r"\W|_", "", one): one for one in known}
         text = re.sub(r"\W|_", "", name.lower())
         near = [plain[one] for one in difflib.get_close_matches(text, plain, 3, 0.5)]
-        near += [
-            one for key, one in plain.items() if len(text) > 2 and text in key and one not in near
-        ]
         remedy = f"the nearest are {', '.join(near)}" if near else "see `mlbatch datasets`"
         raise UsageError(f"{option}: expected the name of a dataset, found {name!r}; {remedy}")
     return FOLDER / f"{name}.yaml"
@@ -162,18 +159,17 @@ def _with_files(node: Node, key: str, folders: Sequence[Path], dataset: Dataset)
 
 def _found(node: Node, folders: Sequence[Path], dataset: Dataset) -> Path:
     for folder in folders:
-        matches = sorted(folder.glob(node.text))
+        if (folder / node.text).is_file():
+            return folder / node.text
+        matches = sorted(folder.glob(node.text)) if "*" in node.text else []
         if len(matches) > 1:
             shown = ", ".join(path.name for path in matches)
             raise node.error(f"one {node.text} in {folder}", shown, "keep that of the recordings")
         if matches:
             return matches[0]
     page = next(iter(dataset.pages["poses"]), "its page")
-    raise node.error(
-        f"{node.text} of {dataset.title} in {folders[0]} or a folder above",
-        "none",
-        f"copy it there ({page})",
-    )
+    where = f"{node.text} of {dataset.title} in {folders[0]} or a folder above"
+    raise node.error(where, "none", f"copy it there ({page})")
 
 
 # -- recognition ----------------------------------------------------------------------------------
@@ -214,10 +210,7 @@ def proposal(found: Sequence[str]) -> str:
     if not found:
         return ""
     first = recipe(found[0])
+    use = f"give --dataset {', or '.join(found)}; its recipe: {first.mark}"
     if first.refused:
-        return (
-            f"topics or files are those of {first.title}, which cannot be batched: {first.refused}"
-        )
-    others = f" (or {', '.join(found[1:])})" if len(found) > 1 else ""
-    use = f"give --dataset {found[0]}{others}"
-    return f"topics or files are those of {first.title}: {use}; its recipe: {first.mark}"
+        use = f"it cannot be batched: {first.refused}"
+    return f"topics or files are those of {first.title}: {use}"

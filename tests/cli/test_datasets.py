@@ -116,9 +116,9 @@ CONVERTED = {
 }  # fmt: skip
 # Refused by --dataset at once; and without it by what their files are.
 REFUSED = {
-    "nuscenes": (made.nuscenes, "nuScenes, which cannot be batched: its points have no time"),
-    "complex_urban": (made.complex_urban, "Complex Urban, which cannot be batched"),
-    "nuplan": (made.nuplan, "nuPlan, which cannot be batched: clouds are merged"),
+    "nuscenes": (made.nuscenes, "nuScenes: it cannot be batched: its points have no time"),
+    "complex_urban": (made.complex_urban, "Complex Urban: it cannot be batched"),
+    "nuplan": (made.nuplan, "nuPlan: it cannot be batched: clouds are merged"),
     "lyft": (made.lyft, "raw points (.bin)"),
     "waymo": (made.waymo, "one time for all points"),
     "argoverse2": (made.argoverse2, "moved to one time"),
