@@ -24,7 +24,7 @@ def take(context: Any, params: Sequence[Any]) -> Mapping[str, str]:
 
     by_key = {str(param.name).rstrip("_"): param for param in params}
     places = {}
-    for option in read_rig(rig).options:
+    for option in read_rig(rig, tuple(context.params.get("recordings") or ())).options:
         param = by_key.get(option.name)
         if param is None:
             continue

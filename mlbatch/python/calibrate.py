@@ -50,7 +50,7 @@ from mlbatch.poses.turning import (
     refused_imu,
     turns_too_little,
 )
-from mlbatch.python.options import Moment, Names, Paths, session_job, window_job
+from mlbatch.python.options import Moment, Names, Paths, recordings_of, session_job, window_job
 from mlbatch.rig.rig import Rig, RigSensor, UnknownExtrinsics, read_rig
 from mlbatch.rig.write import write_rig
 from mlbatch.types import Scan
@@ -80,7 +80,7 @@ def calibrate_job(
 ) -> Job:
     """The job whose scans a calibration reads; shown: the name of an option in errors."""
     if not from_motion:
-        _refuse_unknown(rig)
+        _refuse_unknown(rig, recordings_of(recordings))
     session = session_job(
         recordings,
         {
@@ -98,8 +98,8 @@ def calibrate_job(
     return replace(job, min_range_m=LEAST_RANGE_M, max_range_m=MOST_RANGE_M, checks_poses=False)
 
 
-def _refuse_unknown(rig: Path) -> None:
-    for sensor in read_rig(rig).sensors:
+def _refuse_unknown(rig: Path, recordings: Sequence[Path]) -> None:
+    for sensor in read_rig(rig, recordings).sensors:
         if isinstance(sensor.extrinsics, UnknownExtrinsics):
             raise RigError(
                 f"{sensor.extrinsics.place}: expected a guess of the pose of {sensor.name}, within "
@@ -271,7 +271,7 @@ def rig_text(job: Job, found: Calibration, folder: Path, on: date) -> str:
     All other keys are those of the guess.
     """
     guess = _rig_path(job)
-    rig = read_rig(guess)
+    rig = read_rig(guess, job.recordings)
     lidars = {lidar.name: lidar for lidar in found.lidars}
     sensors = [
         _refined(sensor, lidars[sensor.name], job) if sensor.name in lidars else sensor

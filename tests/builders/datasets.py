@@ -458,6 +458,7 @@ def hilti_2021() -> None:
         "Construction_Site_1.bag",
         clouds("/os_cloud_node/points", OUSTER, after_start_ns),
         customs("/livox/lidar"),
+        other("/imu_adis"),
     )
 
 

@@ -460,6 +460,14 @@ def test_a_copy_of_a_recipe_is_a_rig(shell: Shell) -> None:
     root = read_yaml(FOLDER / "mcd.yaml")
     assert set(root.entries) == {"dataset", "body_frame", "sensors"}
     made.mcd()
-    Path("copy.yaml").write_text(shell("datasets mcd").out.replace("title:", "titel:"))
+    Path("atv_calib.yaml").rename("ntu_day_01/atv_calib.yaml")
+    copy = shell("datasets mcd").out
+    Path("rigs").mkdir()
+    Path("rigs/mcd.yaml").write_text(copy + "convert: {keep_partial: yes}\n")
+    for command in ("convert ntu_day_01 --dry-run", "calibrate ntu_day_01 -o refined.yaml"):
+        outcome = shell(f"{command} --rig rigs/mcd.yaml")
+        # Its files are searched around the recording; there is nothing to calibrate by.
+        assert "*_calib.yaml" not in outcome.err, outcome.err
+    Path("copy.yaml").write_text(copy.replace("title:", "titel:"))
     outcome = shell("convert ntu_day_01 --rig copy.yaml --dry-run")
     assert "copy.yaml:2: dataset.titel: expected a key of title" in outcome.err
