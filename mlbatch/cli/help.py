@@ -35,15 +35,15 @@ _PLACES = {name: at for at, name in enumerate((*options.BY_NAME, *_OTHERS))} | {
 COMMON: Mapping[str, frozenset[str]] = {
     "convert": frozenset(
         {
-            *("recordings", "rig", "metadata", "rate", "deskew"),
-            *("only", "start", "end", "min_range", "exclude_box", "output", "format"),
+            *("recordings", "rig", "dataset", "metadata", "rate", "deskew"),
+            *("only", "start", "end", "exclude_box", "output", "format"),
             *("accumulate", "html", "overwrite", "dry_run", "resume", "fail_on", "quiet"),
         }
     ),
     "batch": frozenset(
         {
-            *("sources", "output", "rig", "workers", "jobs", "part", "only", "plan", "retries"),
-            *("retry_failed", "scheduler", "rate", "format", "fail_on", "quiet"),
+            *("sources", "output", "rig", "dataset", "workers", "jobs", "part", "only", "plan"),
+            *("retries", "retry_failed", "scheduler", "rate", "format", "fail_on", "quiet"),
         }
     ),
 }
