@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from mlbatch.errors import ExportError, install_extra
-from mlbatch.page.policies import KMH_PER_MPS, SPEEDS_KMH, PolicyFigures, offset_m, quantile
+from mlbatch.page.policies import KMH_PER_MPS, SPEEDS_KMH, PolicyFigures, offset_m
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -86,10 +86,8 @@ def _offsets(axes: Axes, policies: Sequence[PolicyFigures]) -> None:
     width = 1 / (len(policies) + 1)
     for number, (one, color) in enumerate(zip(policies, _COLORS, strict=False)):
         at = [group + (number + 1) * width - 0.5 for group in range(len(SPEEDS_KMH))]
-        worst = [
-            offset_m(speed / KMH_PER_MPS, one.span_ms.max(initial=0.0)) for speed in SPEEDS_KMH
-        ]
-        usual = [offset_m(speed / KMH_PER_MPS, quantile(one.apart_ms, 0.5)) for speed in SPEEDS_KMH]
+        worst = [offset_m(speed / KMH_PER_MPS, one.worst_ms) for speed in SPEEDS_KMH]
+        usual = [offset_m(speed / KMH_PER_MPS, one.median(one.apart_ms)) for speed in SPEEDS_KMH]
         axes.bar(at, worst, width * 0.9, color=color, alpha=0.38)
         axes.bar(at, usual, width * 0.9, color=color, label=one.name)
     axes.set_xticks(range(len(SPEEDS_KMH)), [f"{speed} km/h" for speed in SPEEDS_KMH])

@@ -13,10 +13,9 @@ import numpy as np
 from mlbatch.arrays import BoolArray, F32Array, F64Array, I64Array, U8Array, U16Array
 from mlbatch.outputs.stored_scan import StoredScan
 from mlbatch.page.clouds import MOST_CHARS
-from mlbatch.page.document import COLOURS, cloud_data, kept_words
+from mlbatch.page.document import cloud_data
 from mlbatch.page.points import PageCloud, Place, joined_cloud
 from mlbatch.page.policies import offset_m
-from mlbatch.page.templates import asset, page_json
 from mlbatch.units import NS_PER_MS
 
 # Ages are drawn by direction, deg; nearer points have none that lidars share, m.
@@ -25,12 +24,6 @@ _NEAREST_M = 2.0
 # Of the circle around a spot, and from the camera to it, m.
 RADIUS_M = 2.5
 _CAMERA_M = 12.5
-# Of the plots, in pixels.
-_LEFT, _RIGHT, _HEIGHT, _LANE = 56, 888, 200, 14
-_HEAD = (
-    *("set", "age, ms", "lidars apart at the place, ms", "offset there, m"),
-    *("apart at all places: median, ms", "largest, ms", "largest offset, m"),
-)
 
 
 class SetPoints(NamedTuple):
@@ -164,64 +157,7 @@ class SharedInstant:
         times_ns = first_ns, last_ns
         return joined_cloud(place, [scan], self.period_ns, self.columns, stride, times_ns=times_ns)
 
-    def values(self, speed_mps: float, ticks: Sequence[float]) -> dict[str, object]:
-        """Values of the template; speed_mps: of an object; ticks: ages of the plots, ms."""
-        values: dict[str, object] = {
-            "lidars": [(f"k{number % 4}", name) for number, name in enumerate(self.sensors)],
-            "ages": self._ages_plot(ticks),
-        }
-        clouds = self.clouds()
-        if not clouds:
-            return values
-        return values | {
-            "clouds": clouds,
-            "colours": COLOURS,
-            "about": self._about(clouds),
-            "place": self.place_words(speed_mps),
-            "table": (_HEAD, [one.row(speed_mps) for one in self.sets]),
-            "directions": self._direction_plots(ticks),
-            "data": page_json(self._toggle(clouds)),
-            "script": "".join(map(asset, ("viewer.js", "player.js", "comparison.js"))),
-        }
-
-    # -- words --------------------------------------------------------------------------------
-
-    def _about(self, clouds: Sequence[PageCloud]) -> str:
-        kilobytes = sum(one.chars for one in clouds) / len(clouds) / 1000
-        return (
-            f"The end of a window, {self.at_s:.1f} s after the first column: the one of "
-            f"{self.looked} instants at which a fused set differs most from the window. Of each "
-            f"policy the set whose last column is nearest, with {kept_words(clouds[0])}; "
-            f"{kilobytes:,.0f} kB per cloud. Age: time before the instant, negative after it."
-        )
-
-    def place_words(self, speed_mps: float) -> str:
-        """What differs at the place, and how far apart an object stands there."""
-        fused, window, spot = self.sets[self.shown], self.sets[-1], self.spot
-        if spot is None or fused.spot_ms is None:
-            return (
-                "At no place are the lidars of a fused set farther apart in time than those of the "
-                "window by 5 ms or more."
-            )
-        text = "In the circle the times of the lidars differ most."
-        if spot.unmatched:
-            text = (
-                f"In the circle the clouds differ most: {spot.unmatched:,} of {spot.points:,} "
-                "points of the fused set above the ground have no point of the window near them, "
-                "since something moves there, or the body itself."
-            )
-        other = "one lidar alone sees it"
-        if window.spot_ms is not None:
-            other = f"{offset_m(speed_mps, window.spot_ms):.2f} m ({window.spot_ms:.0f} ms)"
-        return (
-            f"{text} There an object at {speed_mps:g} m/s stands at two places "
-            f"{offset_m(speed_mps, fused.spot_ms):.2f} m apart ({fused.name}: {fused.spot_ms:.0f} "
-            f"ms between the lidars); in the window: {other}."
-        )
-
-    # -- data and plots -----------------------------------------------------------------------
-
-    def _toggle(self, clouds: Sequence[PageCloud]) -> dict[str, object]:
+    def toggle(self, clouds: Sequence[PageCloud]) -> dict[str, object]:
         """The data of the player."""
         spot = self.spot and {
             "target": self.spot.centre_m,
@@ -245,50 +181,3 @@ class SharedInstant:
                 for one in clouds
             ],
         }
-
-    def _ages_plot(self, ticks: Sequence[float]) -> dict[str, object]:
-        """Bars from the oldest to the newest column of each lidar."""
-        oldest, newest = self.range_ms
-        scale = (_RIGHT - 2 * _LEFT) / (oldest - newest)
-        height = 28 + _LANE * len(self.sensors)
-        sets = []
-        for row, one in enumerate(self.sets):
-            bars = []
-            for number, (name, ages) in enumerate(zip(self.sensors, one.ages_ms, strict=True)):
-                if ages is not None:
-                    first, last = ages
-                    text = f"{one.name}, {name}: {first:.1f} to {last:.1f} ms before the instant"
-                    x, y = _LEFT + (oldest - first) * scale, row * height + 22 + number * _LANE
-                    bars.append((f"k{number % 4}", x, (first - last) * scale, y, text))
-            first, last = one.range_ms
-            sets.append((row * height + 17, f"{one.name}: {first - last:.0f} ms", bars))
-        return {
-            "height": len(self.sets) * height + 24,
-            "sets": sets,
-            "lane": _LANE - 3,
-            "ticks": [(_LEFT + (oldest - tick) * scale, f"{tick:g} ms") for tick in ticks],
-        }
-
-    def _direction_plots(self, ticks: Sequence[float]) -> list[dict[str, object]]:
-        """Ages by direction, one plot per set."""
-        oldest, newest = self.range_ms
-
-        def x(degrees: float) -> float:
-            return _LEFT + (degrees + 180) / 360 * (_RIGHT - _LEFT)
-
-        def y(age_ms: float) -> float:
-            return 14 + (oldest - age_ms) / (oldest - newest) * (_HEIGHT - 48)
-
-        length = x(_SECTOR_DEG) - x(1)
-        plots = []
-        for one in self.sets:
-            paths = []
-            for number, name in enumerate(self.sensors):
-                ages = one.ages_by_direction(number)
-                path = "".join(f"M{x(at - 2):.1f} {y(age):.1f}h{length:.1f}" for at, age in ages)
-                paths.append((f"k{number % 4}", name, path))
-            plots.append({"name": one.name, "paths": paths})
-        axis = {"unit": "ms", "ticks": [(y(tick), f"{tick:g}") for tick in ticks]}
-        directions = [(x(degrees), f"{degrees} deg") for degrees in range(-180, 180, 60)]
-        shared = {"height": _HEIGHT, "axis": axis, "directions": directions}
-        return [plot | shared for plot in plots]

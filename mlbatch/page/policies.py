@@ -37,6 +37,16 @@ class PolicyFigures:
     apart_ms: F64Array
     latency_ms: F64Array
 
+    @property
+    def worst_ms(self) -> float:
+        """Largest span; 0 without a set."""
+        return float(self.span_ms.max(initial=0.0))
+
+    @staticmethod
+    def median(values: F64Array) -> float:
+        """Median by nearest rank; 0 without values."""
+        return float(np.quantile(values, 0.5, method="inverted_cdf")) if len(values) else 0.0
+
     def shares(self) -> tuple[float, float, float]:
         """Shares of columns used once, more than once, and never."""
         whole = max(1, self.columns)
@@ -48,8 +58,3 @@ class PolicyFigures:
 def offset_m(speed_mps: float, time_ms: float) -> float:
     """Way of an object in a time: how far apart two lidars show it."""
     return speed_mps * time_ms / _MS_PER_S
-
-
-def quantile(values: F64Array, share: float) -> float:
-    """A quantile by nearest rank; 0 without values."""
-    return float(np.quantile(values, share, method="inverted_cdf")) if len(values) else 0.0

@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from mlbatch.page import write_text_page
 from mlbatch.page.comparison import binned, comparison_page, nice_step
 from mlbatch.page.instant import InstantSet, SetPoints, SharedInstant, Spot
-from mlbatch.page.policies import PolicyFigures, offset_m, quantile
+from mlbatch.page.policies import PolicyFigures, offset_m
 from tests.page.browser import CHROMIUM, NO_CHROMIUM, Browser, browser
 
 HOSTILE = "<script>alert(1)</script>&'\""
@@ -53,7 +53,7 @@ def _page(
 
 
 def _set(name: str, oldest_ms: float, *, has_cloud: bool = True) -> InstantSet:
-    """A ring of two lidars, the second of which is up to 50 ms older."""
+    """A ring of two lidars, the second of which is up to 50 ms older; a third one is silent."""
     turn = np.linspace(-np.pi, np.pi, 3600, endpoint=False)
     height = np.random.default_rng(1).uniform(0, 2, len(turn))
     xyz = np.stack([10 * np.cos(turn), 10 * np.sin(turn), height], 1).astype(np.float32)
@@ -62,7 +62,7 @@ def _set(name: str, oldest_ms: float, *, has_cloud: bool = True) -> InstantSet:
     time_ns[lidar == 1] -= round((oldest_ms - 100) * 1e6)
     intensity = np.zeros(len(turn), np.float32)
     points = SetPoints(xyz, lidar, time_ns, lidar.astype(np.uint16), intensity)
-    ages_ms = ((100.0, 0.0), (oldest_ms, oldest_ms - 100))
+    ages_ms = ((100.0, 0.0), (oldest_ms, oldest_ms - 100), None)
     if not has_cloud:
         return InstantSet(name, ages_ms)
     apart_ms = oldest_ms - 100
@@ -73,10 +73,10 @@ def _instant(name: str = "latest sweeps", *, has_clouds: bool = True) -> SharedI
     return SharedInstant(
         at_s=2.1,
         looked=8,
-        sensors=(name, "rear"),
-        poses=(np.eye(4), np.eye(4)),
+        sensors=(name, "rear", "silent"),
+        poses=(np.eye(4),) * 3,
         period_ns=100_000_000,
-        columns=np.array([1800, 1800]),
+        columns=np.array([1800, 1800, 0]),
         sets=tuple(
             _set(one, oldest_ms, has_cloud=has_clouds)
             for one, oldest_ms in ((name, 150.0), ("windows (mlbatch)", 100.0))
@@ -149,7 +149,8 @@ def test_the_instant_is_in_words() -> None:
     without = _page(instant=_instant(has_clouds=False))
     assert "No merged clouds: rear without extrinsics." in without
     assert "latest sweeps, rear: 150.0 to 50.0 ms before the instant" in without
-    same = replace(_instant(), spot=None).place_words(10)
+    assert "latest sweeps, silent:" not in without
+    same = _page(instant=replace(_instant(), spot=None))
     assert "At no place are the lidars of a fused set farther apart" in same
 
 
@@ -196,9 +197,9 @@ def test_parts_contain_every_extreme(pairs: list[tuple[float, float]]) -> None:
         assert high in inside
 
 
-def test_quantiles_are_by_nearest_rank() -> None:
-    assert quantile(np.array([4.0, 1.0, 3.0, 2.0]), 0.5) == 2.0
-    assert quantile(np.zeros(0), 0.5) == 0.0
+def test_medians_are_by_nearest_rank() -> None:
+    assert PolicyFigures.median(np.array([4.0, 1.0, 3.0, 2.0])) == 2.0
+    assert PolicyFigures.median(np.zeros(0)) == 0.0
 
 
 @pytest.fixture(scope="module")
