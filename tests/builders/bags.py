@@ -14,8 +14,7 @@ from math import cos, radians, sin
 
 from mlbatch.readers import open_recording
 from mlbatch.types import StreamTable
-from tests.builders.make_fixtures import FOLDER
-from tests.builders.two_lidars import LEFT, RIGHT, FixtureLidar, metadata
+from tests.builders.two_lidars import FOLDER, LEFT, RIGHT, FixtureLidar
 
 OUSTER_ROS1 = "ouster_ros/PacketMsg"
 NS_PER_S = 1_000_000_000
@@ -183,7 +182,7 @@ def fixture_messages(encoding: str, packet_type: str = "") -> list[Recorded]:
     transforms = "tf2_msgs/TFMessage"
     found = []
     for lidar in (LEFT, RIGHT):
-        text = Body(encoding).text(json.dumps(metadata(lidar))).done()
+        text = Body(encoding).text(json.dumps(lidar.metadata)).done()
         topic = f"/{lidar.name}/ouster/metadata"
         found.append(Recorded(topic, "std_msgs/String", first_ns, text, latched=True))
         edge = transforms_message(encoding, [_mounting(lidar)])

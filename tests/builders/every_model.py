@@ -1,7 +1,8 @@
 """What every model and mode that the encoders know sends, and jobs that convert it.
 
-A dozen packets of each show the hall of `scene.py` from 1.5 m height. Models must be identified by
-their packets; where bytes do not identify them, by a rig.
+A dozen packets of each, with returns from 0.5 to 12 m; both returns of a shot are equal in two of
+three columns. Models must be identified by their packets; where bytes do not identify them, by a
+rig.
 """
 
 from __future__ import annotations
@@ -10,6 +11,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from fractions import Fraction
 from pathlib import Path
+
+import numpy as np
 
 from mlbatch.discovery.discover import SensorSelection
 from mlbatch.pipeline.job import Job
@@ -21,22 +24,11 @@ from mlbatch.simulate.velodyne import encode as velodyne
 from mlbatch.simulate.velodyne.models import MODELS as VELODYNES
 from mlbatch.simulate.velodyne.models import calibration_yaml
 from tests.builders.captures import udp_frame, write_pcap
-from tests.builders.lidar_packets import Payloads, hesai_unit
-from tests.builders.scene import hall
-from tests.builders.seen import (
-    Eye,
-    Seen,
-    hesai_sees,
-    robosense_sees,
-    velodyne_sees,
-)
-from tests.builders.two_lidars import pose
+from tests.builders.lidar_packets import Payloads, Spec, encoded, hesai_unit, shape
 
 PACKETS = 12
 SOURCE = "192.168.1.201"
 HOST = "192.168.1.10"
-# Beams that point up see walls as well.
-EYE = Eye(hall(), pose((3.1, 1.3, 1.5), (9.0, 31.0, -41.0)))
 RIG = """\
 sensors:
   - name: lidar
@@ -45,6 +37,8 @@ sensors:
     extrinsics: {{translation_m: [0, 0, 0], rotation_rpy_deg: [0, 0, 0]}}
 """
 RIG_METADATA = "    metadata: {metadata}\n"
+# Set in the ranges of an Airy, which have 14 bits.
+_AIRY_FLAG = 0x4000
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,36 +50,64 @@ class Sent:
     """
 
     model: str
-    seen: Seen
+    spec: Spec
+    payloads: Payloads
     types: tuple[int, ...]
     neighbours: Payloads = field(default_factory=list)
     file: str = ""
     content: bytes = b""
     is_named: bool = False
 
+    @property
+    def channels(self) -> int:
+        """Of a column."""
+        return shape(self.spec, PACKETS)[1]
+
+    @property
+    def returns(self) -> int:
+        """Of a column: packets that cannot contain both of all columns give each its own."""
+        is_split = not isinstance(self.spec, hesai.HesaiSpec) and self.spec.columns_per_packet % 1
+        return 1 if is_split else self.spec.returns
+
+
+def payloads_of(spec: Spec, unit_m: float, flag: int = 0) -> Payloads:
+    """Packets of a lidar whose distances count in unit_m; flag: further bits of them."""
+    size = shape(spec, PACKETS)
+    random = np.random.default_rng(7)
+    counts = np.rint(random.uniform(0.5, 12, size) / unit_m).astype(np.int64)
+    levels = random.integers(1, 256, size)
+    counts[random.random(size) < 0.1] = 0
+    is_single = np.arange(size[0]) % 3 > 0
+    for values in (counts, levels):
+        values[is_single] = values[is_single, :, :1]
+    if isinstance(spec, hesai.HesaiSpec):
+        counts *= hesai.fires(spec, size[0])[:, :, None]
+    return encoded(spec, counts + flag, levels)
+
 
 def velodyne_sent(model: str, mode: str, name: str = "") -> Sent:
     """name: of a model that sends the same packets."""
     spec = velodyne.VelodyneSpec(model, mode, start_azimuth_deg=357.2, start_us=3_599_997_000.0)
-    sight = velodyne_sees(spec, EYE, PACKETS)
+    payloads = payloads_of(spec, spec.table.unit_m)
     types = {"strongest": (1,), "last": (2,), "dual": ()}[mode]
     if model.startswith("HDL-64E"):
         # Its packets do not name the mode of a single return, nor the series.
         content = calibration_yaml(model).encode()
-        return Sent(model, sight, types and (0,), [], "unit.yaml", content, is_named=True)
-    return Sent(name or model, sight, types, is_named=bool(name))
+        types = types and (0,)
+        return Sent(model, spec, payloads, types, [], "unit.yaml", content, is_named=True)
+    return Sent(name or model, spec, payloads, types, is_named=bool(name))
 
 
 def hesai_sent(model: str, mode: str, operation: str = hesai_models.HIGH) -> Sent:
     """mode: byte of the return mode; operation: of models with protocol 1.4."""
     # All columns of an AT128 lie within the field of one mirror.
     spec = hesai.HesaiSpec(model, int(mode, 16), start_deg=351.3, operation=operation)
-    beams, file, content = hesai_unit(model, spec.row.channels)
-    sight = hesai_sees(spec, beams, EYE, PACKETS)
+    _, file, content = hesai_unit(model, spec.row.channels)
+    payloads = payloads_of(spec, spec.row.unit_mm / 1000)
     types: tuple[int, ...] = {"33": (0,), "37": (1,), "38": (2,)}.get(mode, ())
     if model == "JT16":  # Nothing in its packets identifies it.
         types = (0,)
-    return Sent(model.removesuffix("-7"), sight, types, [], file, content)
+    return Sent(model.removesuffix("-7"), spec, payloads, types, [], file, content)
 
 
 def robosense_sent(model: str, mode: str, mount: str = "normal") -> Sent:
@@ -93,14 +115,13 @@ def robosense_sent(model: str, mode: str, mount: str = "normal") -> Sent:
     spec = robosense.RobosenseSpec(
         model, mode, start_deg=357.2, mount=mount, start_ns=robosense.START_NS + 1_234_567
     )
-    angles = robosense.fan(spec)
-    sight = robosense_sees(spec, angles, EYE, PACKETS)
+    flag = _AIRY_FLAG if model.startswith("Airy") else 0
+    payloads = payloads_of(spec, spec.range_unit_m, flag)
     types: tuple[int, ...] = {"strongest": (1,), "last": (2,), "nearest": (0,)}.get(mode, ())
-    if sight.returns < spec.returns:
+    if spec.columns_per_packet % 1:
         types = (0,)
-    name = ROBOSENSE_NAMES.get(model, model)
-    device_packets = [(sight.payloads[0][0] + 1, robosense.difop(spec, angles))]
-    return Sent(name, sight, types, device_packets)
+    device_packets = [(payloads[0][0] + 1, robosense.difop(spec, robosense.fan(spec)))]
+    return Sent(ROBOSENSE_NAMES.get(model, model), spec, payloads, types, device_packets)
 
 
 ROBOSENSE_NAMES = {
@@ -156,7 +177,7 @@ def job_of(sent: Sent, folder: Path) -> Job:
     """A job on a recording of it, which is written into the folder."""
     records = [
         (host_ns, udp_frame(payload, SOURCE, HOST, port, port)[0])
-        for port, payloads in ((2368, sent.seen.payloads), (7788, sent.neighbours))
+        for port, payloads in ((2368, sent.payloads), (7788, sent.neighbours))
         for host_ns, payload in payloads
     ]
     path = write_pcap(folder / "lidar.pcap", sorted(records))

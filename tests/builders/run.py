@@ -42,6 +42,7 @@ from tests.builders.parser import parser
 ROOT = Path(__file__).resolve().parents[2]
 RECORDINGS = ROOT / ".." / "shared" / "recordings"
 TWO_LIDARS = ROOT / "fixtures" / "two_lidars"
+FOUR_MAKERS = ROOT / "fixtures" / "four_makers"
 
 Arrays = dict[str, npt.NDArray[np.generic]]
 

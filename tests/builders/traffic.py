@@ -10,8 +10,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from tests.builders.captures import ETHERNET, udp_frame
-from tests.builders.make_fixtures import START_NS
 from tests.builders.run import FIXTURE
+from tests.builders.two_lidars import START_NS
 
 Records = list[tuple[int, bytes]]
 

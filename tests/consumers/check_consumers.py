@@ -16,8 +16,7 @@ import numpy as np
 import pytest
 
 from tests.builders.captures import pcap_bytes
-from tests.builders.four_makers import FOLDER as FOUR_MAKERS
-from tests.builders.run import TWO_LIDARS, command
+from tests.builders.run import FOUR_MAKERS, TWO_LIDARS, command
 from tests.builders.traffic import datagrams_of, read_pcap
 from tests.consumers.environments import need_library, read_by, run_in, run_of_system
 

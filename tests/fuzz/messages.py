@@ -20,7 +20,7 @@ from mlbatch.types import StreamTable, Topic
 from tests.builders import points
 from tests.builders.bags import Body, Recorded, definition, packet_message, transforms_message
 from tests.builders.sessions_of_bags import description, urdf
-from tests.builders.two_lidars import LEFT, metadata
+from tests.builders.two_lidars import LEFT
 from tests.fuzz.decoding import decode_samples
 from tests.fuzz.framing import Part, joined, parts_of
 from tests.fuzz.harness import Target
@@ -79,7 +79,7 @@ def _other_seeds() -> Seeds:
     seeds = []
     for encoding in ("cdr", "ros1"):
         frames = transforms_message(encoding, [edge, edge])
-        text = Body(encoding).text(json.dumps(metadata(LEFT))).done()
+        text = Body(encoding).text(json.dumps(LEFT.metadata)).done()
         layout = Body(encoding).put("I", 0, 0).blob(b"Laser id,Elevation,Azimuth\n1,2,3\n").done()
         robot: Recorded = description(urdf(0.5), 10**18)
         robot_text = Body(encoding).text(urdf(0.25)).done() if encoding == "ros1" else robot.data

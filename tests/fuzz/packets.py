@@ -57,7 +57,7 @@ def _streams() -> dict[str, Seeds]:
         if sent.file:
             kind = NAMES.index(Path(sent.file).suffix)
             parts.append(Part(CALIBRATION, kind, sent.content))
-        parts += [Part(_LIDAR_PORT, at, data) for at, data in sent.seen.payloads[:_PACKETS]]
+        parts += [Part(_LIDAR_PORT, at, data) for at, data in sent.payloads[:_PACKETS]]
         parts += [Part(DEVICE_PORT, at, data) for at, data in sent.neighbours]
         found.setdefault(make.__name__.removesuffix("_sent"), []).append(joined(parts))
     spec = velodyne.VelodyneSpec("VLP-16")

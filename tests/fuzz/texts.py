@@ -21,16 +21,16 @@ from mlbatch.rig.rig import Rig, read_rig
 from mlbatch.rig.write import write_rig
 from mlbatch.sensors.options import check_options
 from mlbatch.types import StreamTable
-from tests.builders.four_makers import RIG
 from tests.builders.sessions_of_bags import urdf
 from tests.contract.tree import ROOT
 from tests.fuzz.harness import BrokenLaw, Target
 from tests.fuzz.mutation import NUMBERS, Seeds, mutated_text
 
 _FIXTURES = tuple(sorted((ROOT / "fixtures").glob("*/rig.yaml")))
-_FULL_RIG = (
-    RIG
-    + """\
+_FULL_RIG = """\
+body_frame: base_link
+rate_hz: 20
+sensors:
   - name: left
     model: auto
     stream: {source_ip: 10.5.5.87, port: 7502, serial: "122201000998"}
@@ -55,7 +55,6 @@ _FULL_RIG = (
 exclude_boxes_m:
   - [-1, -1, 0, 1, 1, 2]
 """
-)
 
 
 def _rigs() -> Seeds:

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from mlbatch.outputs.stored_scan import COLUMN_NS
@@ -21,6 +22,7 @@ from tests.builders.every_model import (
     robosense_sent,
     velodyne_sent,
 )
+from tests.builders.lidar_packets import firing_ns
 from tests.builders.points import STAMP_NS, VELODYNE, cloud_message, write_points
 from tests.builders.rosbag2 import write_rosbag2
 from tests.builders.run import ROOT, command
@@ -63,7 +65,7 @@ ODD: dict[str, Callable[[], Sent]] = {
 @pytest.mark.parametrize("name", ODD)
 def test_odd_lidars_are_clean(name: str, tmp_path: Path) -> None:
     sent = ODD[name]()
-    longest_ns = int((sent.seen.firing_ns - sent.seen.stamp_ns[:, None]).max())
+    longest_ns = int(np.ptp(firing_ns(sent.spec, sent.payloads), axis=1).max())
     assert 5 * longest_ns < COLUMN_NS
     (path,) = job_of(sent, tmp_path).recordings
     words: tuple[str | Path, ...] = ("--metadata", tmp_path / sent.file) if sent.file else ()

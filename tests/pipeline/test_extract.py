@@ -25,13 +25,13 @@ from mlbatch.types import StreamTable
 from mlbatch.units import NS_PER_S
 from tests.builders.bags import Body, Recorded
 from tests.builders.captures import pcap_bytes, udp_frame
-from tests.builders.four_makers import FOLDER
 from tests.builders.livox import LivoxSpec, point_packets
 from tests.builders.mcaps import write_mcap
 from tests.builders.messages import Unit, messages
 from tests.builders.rosbag1 import write_rosbag1
 from tests.builders.run import (
     FIXTURE,
+    FOUR_MAKERS,
     ROOT,
     TWO_LIDARS,
     buffers_of,
@@ -47,7 +47,9 @@ from tests.matrix.lidars import VENDORS, write_metadata
 
 TARGETS = (".pcap", ".mcap", ".db3", ".bag")
 FOUR = Job(
-    (FOLDER / "four_makers.pcap",), SensorSelection(rig=FOLDER / "rig.yaml"), keep_partial=True
+    (FOUR_MAKERS / "four_makers.pcap",),
+    SensorSelection(rig=FOUR_MAKERS / "rig.yaml"),
+    keep_partial=True,
 )
 FRAMES = read_pcap(FIXTURE.recordings[0])
 SCAN = "hesai_lidar/PandarScan"

@@ -15,10 +15,9 @@ from mcap.reader import make_reader
 
 from mlbatch.pipeline.job import Job
 from tests.builders.captures import pcap_bytes
-from tests.builders.make_fixtures import START_NS
 from tests.builders.run import BY_HOST, FIXTURE, Values, buffers_of, in_memory, prints, to_file
 from tests.builders.traffic import Records, datagrams, frames, source
-from tests.builders.two_lidars import LEFT, RIGHT
+from tests.builders.two_lidars import LEFT, RIGHT, START_NS
 
 # Head, two whole windows and a tail.
 LENGTH_NS = 350_000_000
