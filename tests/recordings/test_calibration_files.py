@@ -7,17 +7,12 @@ import math
 import numpy as np
 import pytest
 
-from mlbatch.lidar.geometry import read_rotor_words
 from mlbatch.sensors import read_calibration
 from mlbatch.sensors.hesai.angles import read_angles, read_at128
 from mlbatch.sensors.velodyne.calibration import VelodyneFile
 from mlbatch.simulate.velodyne.models import MODELS
-from tests.builders.decoded import projected
-from tests.builders.rotor import rotor_words
 from tests.recordings import RECORDINGS
-from tests.sensors.hesai.test_at128 import CHANNELS, DEG, NO_FIRING, beams, by_the_sheet
 from tests.sensors.test_files import read
-from tests.sensors.velodyne.test_geometry import check_many_points
 
 VELODYNE_FOLDER = RECORDINGS / "velodyne"
 # Real files: the first lines, read by eye; angles of docs/sources/velodyne.md section 6.
@@ -94,47 +89,6 @@ def test_at128_real_dat_file() -> None:
     assert found.elevation_rad.max() * degrees == pytest.approx(12.92, abs=0.011)
 
 
-AT128 = RECORDINGS / "hesai" / "calibration-without-recording" / "PandarAT128.dat"
-
-
-def test_real_file_against_plain_loops() -> None:
-    file = read_at128(AT128, AT128.read_bytes())
-    assert file is not None
-    rng = np.random.default_rng(7)
-    columns = 40
-    firing_ns = rng.integers(0, 15_000, (2, CHANNELS))
-    encoder = rotor_words(
-        rng.random(columns), rng.choice([-200, 0, 200], columns) / 60, rng.integers(0, 2, columns)
-    )
-    range_m = rng.uniform(1, 180, (columns, CHANNELS)).astype(np.float32)
-    found = projected(beams(file, firing_ns), encoder, range_m)
-    angle, speed, table = read_rotor_words(encoder)
-    worst_m = 0.0
-    for column in range(columns):
-        for channel in range(CHANNELS):
-            rotor = angle[column] + speed[column] * firing_ns[table[column], channel]
-            vector = np.array(by_the_sheet(file, float(rotor), channel))
-            expected = vector * float(range_m[column, channel])
-            worst_m = max(worst_m, float(np.abs(found[column, channel] - expected).max()))
-    # Single precision, at up to 180 m: 3e-7 of it.
-    assert worst_m < 6e-5
-
-
-def test_field_of_view_of_the_real_file() -> None:
-    """Beams with adjustments cover 30 to 150 deg and a margin."""
-    file = read_at128(AT128, AT128.read_bytes())
-    assert file is not None
-    encoder = rotor_words(np.arange(180) / 180, np.zeros(180))
-    found = projected(beams(file, NO_FIRING), encoder, np.ones((180, CHANNELS), np.float32))
-    given = file.azimuth_adjust_rad.T != 0
-    azimuth = np.arctan2(found[:, :, 0], found[:, :, 1])[given] / DEG
-    assert 10 < azimuth.min() < 30
-    assert 150 < azimuth.max() < 170
-    elevation = np.arcsin(found[:, :, 2][given]) / DEG
-    assert -15 < elevation.min() < -12
-    assert 12 < elevation.max() < 15
-
-
 def test_a_real_hdl_64e_has_all_corrections() -> None:
     file = real("calibration-without-recording/HDL64e_s2.yaml")
     assert file.azimuth_rad[0] == -0.1248942899601548
@@ -144,8 +98,3 @@ def test_a_real_hdl_64e_has_all_corrections() -> None:
     assert file.dist_correction_y_m[1] == 1.5491043
     assert file.vert_offset_m[0] == 0.19548199
     assert file.horiz_offset_m[:2].tolist() == [0.025999999, -0.025999999]
-
-
-@pytest.mark.parametrize("name", ["HDL64e_s2.yaml", "HDL64e_s3.yaml"])
-def test_points_of_real_hdl_64e_files_equal_the_scalar_loop(name: str) -> None:
-    check_many_points(real(f"calibration-without-recording/{name}"))

@@ -38,7 +38,7 @@ from mlbatch.discovery.match import match
 from mlbatch.discovery.sampler import Sampler, split_by_kind
 from mlbatch.pipeline.job import Job
 from mlbatch.readers import merge, open_recording
-from mlbatch.types import ColumnHeaders, StreamTable
+from mlbatch.types import StreamTable
 from tests.builders.engines import check_conversion
 from tests.builders.loss import Came
 from tests.builders.run import command
@@ -312,30 +312,6 @@ def test_what_is_taken_out_is_what_is_lost(row: Row, share: float, seed: int) ->
     packets, missing = _only(row), int(np.count_nonzero(~came))
     assert packets.counted(came) == (missing, 0)
     assert packets.counted(came, size=7) == (missing, 0)
-
-
-@every_long
-def test_packets_lost_in_a_row(row: Row) -> None:
-    """A quarter of the recording, from its middle on."""
-    silent = row.packets // 4
-    came = np.ones(row.packets, bool)
-    came[row.packets // 2 : row.packets // 2 + silent] = False
-    assert _only(row).counted(came) == (silent, 0)
-
-
-@every_long
-def test_packets_that_cross_are_not_lost(row: Row) -> None:
-    packets = _only(row)
-    order = np.arange(row.packets)
-    order[4:-4:10], order[5:-3:10] = order[5:-3:10].copy(), order[4:-4:10].copy()
-    headers = packets.headers
-    crossed = Came(
-        packets.lidar,
-        packets.sequence[order],
-        ColumnHeaders(headers.stamp_ns[order], headers.encoder[order], headers.valid[order]),
-        packets.host_ns,
-    )
-    assert crossed.counted() == (0, len(order[4:-4:10]))
 
 
 # -- points and bytes -----------------------------------------------------------------------------

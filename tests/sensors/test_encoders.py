@@ -1,7 +1,7 @@
 """Encoders against bytes, times and angles worked out by hand from docs/sources.
 
-Of HESAI and ROBOSENSE every model's bytes are laid out by hand for the decoder (`hesai/`,
-`robosense/`), which `test_round_trip.py` compares with the encoders.
+Bytes of HESAI families are laid out by hand for the decoder (`hesai/test_points.py`), which
+`test_round_trip.py` compares with the encoders; HESAI firing tables: `hesai/test_firing.py`.
 """
 
 from __future__ import annotations

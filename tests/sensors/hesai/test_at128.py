@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mlbatch.arrays import F64Array, I64Array
+from mlbatch.arrays import I64Array
 from mlbatch.sensors.hesai.angles import At128File
 from mlbatch.sensors.hesai.projections import at128_projection
 from tests.builders.decoded import Rotor, projected
@@ -114,24 +114,3 @@ def test_silent_beams_count_as_the_column_and_words_choose_the_table() -> None:
     found = projected(beams(plain_file(), firing_ns), encoder, np.ones((2, CHANNELS), np.float32))
     azimuth = np.arctan2(found[:, 0, 0], found[:, 0, 1]) / DEG
     assert azimuth == pytest.approx([60.0, 62.4], abs=1e-4)
-
-
-def by_the_sheet(file: At128File, rotor_rad: float, channel: int) -> tuple[float, float, float]:
-    """The unit vector of a beam; the rule of the source, in degrees."""
-    rotor = math.degrees(rotor_rad) % 360
-    past = min((rotor - start) % 360 for start in np.degrees(file.start_rad).tolist())
-    low = int(rotor // 2)
-    part = rotor / 2 - low
-
-    def adjust(table: F64Array) -> float:
-        row = np.degrees(table[channel])
-        return float(row[low] + part * (row[(low + 1) % 180] - row[low]))
-
-    azimuth = 2 * past - math.degrees(file.azimuth_rad[channel]) + adjust(file.azimuth_adjust_rad)
-    elevation = math.degrees(file.elevation_rad[channel]) + adjust(file.elevation_adjust_rad)
-    flat = math.cos(math.radians(elevation))
-    return (
-        flat * math.sin(math.radians(azimuth)),
-        flat * math.cos(math.radians(azimuth)),
-        math.sin(math.radians(elevation)),
-    )

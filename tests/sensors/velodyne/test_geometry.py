@@ -14,7 +14,7 @@ import pytest
 
 from mlbatch.arrays import F32Array, F64Array, I64Array
 from mlbatch.lidar.interface import Calibration
-from mlbatch.sensors.velodyne.calibration import VelodyneFile, read_velodyne
+from mlbatch.sensors.velodyne.calibration import VelodyneFile
 from mlbatch.sensors.velodyne.packets import hdl64_projection
 from mlbatch.sensors.velodyne.sensor import VelodyneCalibration
 from mlbatch.simulate.velodyne.encode import VelodyneSpec
@@ -112,55 +112,6 @@ def test_beams_fire_while_the_rotor_rotates() -> None:
     assert points[1, 1] == pytest.approx([9.9999507, -0.0314154, 0], abs=1e-6)
     still = project(unit(Laser()), np.zeros(2), ranges, firing_ns, hz=10.0, table=0)
     assert still[1, 1] == pytest.approx([10, 0, 0], abs=1e-6)
-
-
-def scalar_point(
-    file: VelodyneFile, laser: int, azimuth_rad: float, d: float
-) -> tuple[float, float, float]:
-    """Section 10 literally, in the ROS axes of section 5."""
-    c, cx, cy, h, o, rot, w = (
-        float(values[laser])
-        for values in (
-            *(file.dist_correction_m, file.dist_correction_x_m, file.dist_correction_y_m),
-            *(file.horiz_offset_m, file.vert_offset_m, file.azimuth_rad, file.elevation_rad),
-        )
-    )
-    alpha = azimuth_rad - rot
-    q = (d + c) * math.cos(w)
-    x, y = abs(q * math.sin(alpha)), abs(q * math.cos(alpha))
-    kx = ky = kz = c
-    if cx != 0 and cy != 0 and d < 25.04:
-        kx = cx + (c - cx) * (x - 2.40) / (25.04 - 2.40)
-        ky = cy + (c - cy) * (y - 1.93) / (25.04 - 1.93)
-        kz = (kx + ky) / 2
-    right = (d + kx) * math.cos(w) * math.sin(alpha) - h * math.cos(alpha)
-    forward = (d + ky) * math.cos(w) * math.cos(alpha) + h * math.sin(alpha)
-    return forward, -right, (d + kz) * math.sin(w) + o
-
-
-def check_many_points(file: VelodyneFile) -> None:
-    """Random points against the formulas, point by point."""
-    rng = np.random.default_rng(64)
-    azimuth_deg = rng.uniform(0, 360, 40)
-    # Half of them nearer than 25 m, where corrections change.
-    is_near = rng.random((40, LASERS)) < 0.5
-    range_m = np.where(is_near, rng.uniform(0.5, 25, (40, 64)), rng.uniform(25, 120))
-    range_m = range_m.astype(np.float32).astype(np.float64)
-    firing_ns = rng.integers(0, 57_600, LASERS)
-    points = project(file, azimuth_deg, range_m, firing_ns[None], hz=15.0)
-    turned_rad = np.deg2rad(azimuth_deg)[:, None] + 2 * math.pi * 15e-9 * firing_ns
-    expected = [
-        [scalar_point(file, laser, turned_rad[n, laser], range_m[n, laser]) for laser in range(64)]
-        for n in range(40)
-    ]
-    # Float32 at 120 m: 8e-6 m a step; a count of distance is 2e-3 m.
-    assert np.abs(points - np.array(expected)).max() < 5e-5
-
-
-def test_many_points_equal_the_scalar_loop() -> None:
-    file = read_velodyne(Path("unit.yaml"), calibration_yaml("HDL-64E S2").encode())
-    assert file is not None
-    check_many_points(file)
 
 
 @pytest.mark.parametrize(
