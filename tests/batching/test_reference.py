@@ -34,15 +34,6 @@ def batched(feed: Sequence[FeedPacket], options: Settings) -> Outcome:
     return outcome
 
 
-def columns_ms(feed: Sequence[FeedPacket], outcome: Outcome, index: int) -> list[tuple[int, float]]:
-    """(sensor, stamp in ms) of the columns of a window."""
-    packets = [[one for one in feed if one.sensor == sensor] for sensor in range(5)]
-    return [
-        (sensor, packets[sensor][number].stamps[column] / MS)
-        for sensor, number, column in at_index(outcome, index).columns
-    ]
-
-
 # -- grid ---------------------------------------------------------------------------------------
 
 

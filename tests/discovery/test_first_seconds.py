@@ -18,7 +18,6 @@ from tests.builders.sessions import FIXTURE, Shell, Unit, twin, write_session
 
 CAPTURE = FIXTURE / "two_lidars.pcap"
 RUN = f"convert {CAPTURE} --rig {FIXTURE / 'rig.yaml'} --dry-run --quiet"
-INSPECT = f"inspect {CAPTURE}"
 Payloads = list[tuple[int, bytes]]
 
 

@@ -85,51 +85,6 @@ def test_removed_packets(specs: str, gone: tuple[bytes, ...], each: int) -> None
     assert sum(ledger.removed for ledger in faults.ledgers) == len(gone)
 
 
-@pytest.mark.parametrize("each", [1, 2, 3, 100])
-def test_a_delayed_sensor_is_merged_by_its_new_receive_times(each: int) -> None:
-    seen, faults = replay("delay:left:11ms", each)
-    # Equal receive times at 11, 21 and 31 ms: the earlier packet is first.
-    assert seen == [
-        (1, 1, b"b0"),
-        (11, 0, b"a0"),
-        (11, -1, b"c0"),
-        (21, 0, b"a1"),
-        (21, 1, b"b1"),
-        (31, 0, b"a2"),
-        (41, 0, b"a3"),
-    ]
-    assert faults.counts == (FaultCount("delay:left:11ms", 4),)
-
-
-@pytest.mark.parametrize("each", [1, 2, 3, 100])
-def test_every_second_packet_is_moved_if_all_are_chosen(each: int) -> None:
-    seen, faults = replay("reorder:left:100%", each)
-    assert seen == [
-        (1, 1, b"b0"),
-        (10, 0, b"a1"),
-        (10, 0, b"a0"),
-        (11, -1, b"c0"),
-        (21, 1, b"b1"),
-        (30, 0, b"a3"),
-        (30, 0, b"a2"),
-    ]
-    assert faults.counts == (FaultCount("reorder:left:100%", 2),)
-
-
-@pytest.mark.parametrize("each", [1, 2, 100])
-def test_a_moved_packet_without_a_next_one_is_last(each: int) -> None:
-    seen, faults = replay("early:left:25ms reorder:left:100%", each)
-    assert seen == [
-        (1, 1, b"b0"),
-        (10, 0, b"a1"),
-        (10, 0, b"a0"),
-        (11, -1, b"c0"),
-        (21, 1, b"b1"),
-        (30, 0, b"a2"),
-    ]
-    assert [count.packets for count in faults.counts] == [1, 1]
-
-
 @pytest.mark.parametrize("fault", ["bitflip", "truncate"])
 def test_hashes_of_damaged_payloads_are_not_known(fault: str) -> None:
     hashed = (replace(one, content_key=np.arange(len(one))) for one in batches(3))
@@ -187,12 +142,6 @@ def test_a_clock_step_shifts_later_packets() -> None:
     assert faults.shift_ns(0, at_ms(0, 19, 20, 21)).tolist() == [0, 0, -37 * S, -37 * S]
     assert faults.shift_ns(1, at_ms(0, 20)).tolist() == [0, 0]
     assert faults.counts == (FaultCount("jump:left:-37s@20ms", 2),)
-
-
-def test_shifts_add_up() -> None:
-    _, faults = replay("drift:left:-1ppm jump:left:1s@1s jump:*:5s@2s")
-    shifts = faults.shift_ns(0, at_ms(1000, 2000)).tolist()
-    assert shifts == [S - 1000, 6 * S - 2000]
 
 
 def test_clock_steps_do_not_depend_on_the_delay() -> None:
