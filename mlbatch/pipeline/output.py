@@ -127,16 +127,15 @@ class Output:
         """The map that is to be written, checked; None without, and in a dry run."""
         request = self._request
         if request.accumulate is None:
-            for option, is_given in (("--voxel", request.voxel), ("--crs", request.crs)):
-                if is_given:
-                    raise UsageError(
-                        f"{option}: expected --accumulate MAP, found none; leave it out, or write "
-                        "--accumulate map.laz"
-                    )
+            if request.voxel or request.crs:
+                raise UsageError(
+                    f"{'--voxel' if request.voxel else '--crs'}: expected --accumulate MAP, found "
+                    "none; leave it out, or write --accumulate map.laz"
+                )
             return None
         from mlbatch.pipeline.accumulate import check_map, map_of
 
-        found = map_of(job, request)
+        found = map_of(job, request, request.accumulate)
         if request.dry_run:
             return None
         check_map(job, found, request.written)

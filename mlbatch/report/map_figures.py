@@ -2,31 +2,27 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from dataclasses import dataclass
 
 
-class MapFigures(NamedTuple):
-    """A map; low_m, high_m: its corners; offset_m: that its file subtracts, x, y, z."""
+@dataclass(slots=True)
+class MapFigures:
+    """A map; low_m, high_m: its corners; offset_m: of the coordinates in its file; x, y, z."""
 
     file: str  # without folders
-    scans: int
-    points: int
-    thinned: int  # not the first point in their voxel
     voxel_m: float  # 0: no voxels
     crs: str  # as EPSG:NNNN, or ""
-    offset_m: tuple[float, ...]
-    low_m: tuple[float, ...]
-    high_m: tuple[float, ...]
+    scans: int = 0
+    points: int = 0
+    thinned: int = 0  # not the first point in their voxel
+    offset_m: tuple[float, ...] = ()
+    low_m: tuple[float, ...] = ()
+    high_m: tuple[float, ...] = ()
 
     def describe(self) -> str:
         """A line of the summary."""
-        extent = " x ".join(
-            f"{high - low:.1f}" for low, high in zip(self.low_m, self.high_m, strict=True)
-        )
-        thinned = ""
-        if self.voxel_m:
-            thinned = f" ({self.thinned} more in voxels of {self.voxel_m:g} m that have one)"
+        sizes = (high - low for low, high in zip(self.low_m, self.high_m, strict=True))
+        extent = " x ".join(f"{size_m:.1f}" for size_m in sizes)
+        thinned = f" ({self.thinned} more in the same {self.voxel_m:g} m)" if self.voxel_m else ""
         crs = f", {self.crs}" if self.crs else ""
-        return (
-            f"map {self.file}: {self.points} points{thinned} of {self.scans} scans, {extent} m{crs}"
-        )
+        return f"map of {self.scans} scans: {self.points} points{thinned}, {extent} m{crs}"

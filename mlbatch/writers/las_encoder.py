@@ -1,4 +1,4 @@
-"""Scans as LAS 1.4 files, and as LAZ, compressed by lazrs (LASzip).
+"""Scans as LAS 1.4 files, and as LAZ, compressed by lazrs.
 
 Sources: ASPRS, "LAS specification 1.4 R15", tables 3, 4, 16 and 24; docs/sources/outputs.md
 section 6.
@@ -9,11 +9,10 @@ from __future__ import annotations
 import importlib
 import io
 import struct
-from collections.abc import Sequence
 from datetime import datetime, timezone
 from pathlib import Path
 from types import ModuleType
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING
 
 import mlbatch
 from mlbatch.clocks.timescale import GPS_EPOCH_S, TAI, TAI_GPS_S, UTC, gps_utc_s
@@ -43,8 +42,6 @@ _STANDARD_TIME = 1
 # Required of this point format, also without a coordinate system.
 _WKT = 16
 _POINT_FORMAT = 6
-# Of a record, before the extra bytes.
-BASE_BYTES = 30
 _COMPRESSED = 128
 # Table 4: reserved, user, number, bytes after it, description.
 _VLR = struct.Struct("<H16sHH32s")
@@ -52,7 +49,7 @@ _VLR = struct.Struct("<H16sHH32s")
 _EXTRA = struct.Struct("<2xBB32s4x24x8s16x8s16x24x24x32s")
 _HAS_EXTREMES = 6
 # Name, data type, description, form of the extremes, and those of no points.
-_EXTRA_BYTES = (
+EXTRA_BYTES = (
     ("time_ns", 5, "ns after start_ns", "<Q"),
     ("ring", 3, "channel over all sensors", "<Q"),
     ("return_type", 1, "0 unknown, 1 to 7", "<Q"),
@@ -104,13 +101,13 @@ def open_folder(
     return FolderWriter(target, info, options, name, lambda: LasEncoder(lazrs))
 
 
-def load_lazrs(option: str) -> ModuleType:
-    """Return the compressor; UsageError without it; option: what needs it."""
+def load_lazrs(option: str = "--format laz", package: str = "lazrs") -> ModuleType:
+    """Return the compressor, or another package of the extra `las`; UsageError without it."""
     try:
-        return importlib.import_module("lazrs")
+        return importlib.import_module(package)
     except ImportError as err:
         raise UsageError(
-            f"{option}: expected the package lazrs, found none ({err}); {install_extra('las')}"
+            f"{option}: expected the package {package}, found none ({err}); {install_extra('las')}"
         ) from err
 
 
@@ -128,15 +125,15 @@ class LasEncoder:
         point_bytes = (RECORD if scan.reflectivity is not None else _PLAIN).step
         text = "\n".join(scan_comments(scan, "x y z m; gps_time s; time_ns ns after start_ns"))
         vlrs = [
-            vlr("LASF_Spec", 4, "Extra Bytes Record", _extra_bytes(records, point_bytes)),
-            vlr(VLR_USER, VLR_NUMBER, "scan", text.encode()),
+            _vlr("LASF_Spec", 4, "Extra Bytes Record", _extra_bytes(records, point_bytes)),
+            _vlr(VLR_USER, VLR_NUMBER, "scan", text.encode()),
         ]
-        head = _head(scan, packed, point_bytes)
         if self._lazrs is None:
-            return [las_header(head, vlrs), records]
-        items = lazrs_items(self._lazrs, point_bytes)
+            return [_header(scan, packed, vlrs, _POINT_FORMAT, point_bytes), records]
+        items = self._lazrs.LazVlr.new_for_compression(_POINT_FORMAT, point_bytes - 30)
+        vlrs.append(_vlr("laszip encoded", 22204, "http://laszip.org", items.record_data()))
         stream = io.BytesIO()
-        stream.write(las_header(head, vlrs, items))
+        stream.write(_header(scan, packed, vlrs, _POINT_FORMAT | _COMPRESSED, point_bytes))
         # Threads come from --jobs.
         compressor = self._lazrs.LasZipCompressor(stream, items)
         if len(records):
@@ -145,29 +142,13 @@ class LasEncoder:
         return [stream.getbuffer()]
 
 
-class LasHead(NamedTuple):
-    """What a header says of points.
-
-    start_ns: of the first scan; counts: all points, and the farther of two returns; low_m, high_m:
-    corners, with the offset; point_bytes: of a record.
-    """
-
-    timescale: str
-    start_ns: int
-    counts: tuple[int, int]
-    low_m: Sequence[float]
-    high_m: Sequence[float]
-    point_bytes: int
-    scale_m: float = SCALE_M
-    offset_m: Sequence[float] = (0.0, 0.0, 0.0)
-
-
-def _head(scan: Scan, packed: PackedPoints, point_bytes: int) -> LasHead:
-    """Return what the header of a scan says; ExportError where coordinates do not fit."""
+def _header(
+    scan: Scan, packed: PackedPoints, vlrs: list[bytes], point_format: int, point_bytes: int
+) -> bytes:
+    """Return a header and its variable length records."""
     (count,) = packed.shape
     second = 0
-    low_m: Sequence[float] = (0.0, 0.0, 0.0)
-    high_m = low_m
+    bounds = [0.0] * 6
     if packed.totals is not None and count:
         low_m, high_m, second = packed.totals
         farthest_m = max(map(abs, (*low_m, *high_m)))
@@ -177,41 +158,24 @@ def _head(scan: Scan, packed: PackedPoints, point_bytes: int) -> LasHead:
                 f"laz, found {farthest_m:.0f} m; write another format, or --max-range"
             )
         # Rounded as the coordinates, half to even.
-        low_m, high_m = ([round(m / SCALE_M) * SCALE_M for m in ends] for ends in (low_m, high_m))
-    timescale = scan.info.timescale
-    return LasHead(timescale, scan.start_ns, (count, second), low_m, high_m, point_bytes)
-
-
-def lazrs_items(lazrs: ModuleType, point_bytes: int) -> Any:
-    """Return the description of compressed points of so many bytes; lazrs has no types."""
-    return lazrs.LazVlr.new_for_compression(_POINT_FORMAT, point_bytes - BASE_BYTES)
-
-
-def las_header(head: LasHead, vlrs: Sequence[bytes], items: Any = None) -> bytes:
-    """Return a header and its variable length records; items: of compressed points."""
-    point_format = _POINT_FORMAT
-    if items is not None:
-        laszip = vlr("laszip encoded", 22204, "http://laszip.org", items.record_data())
-        vlrs = [*vlrs, laszip]
-        point_format |= _COMPRESSED
-    is_standard = head.timescale in (UTC, TAI)
+        ends = (end_m for ends_m in zip(high_m, low_m, strict=True) for end_m in ends_m)
+        bounds = [round(end_m / SCALE_M) * SCALE_M for end_m in ends]
+    is_standard = scan.info.timescale in (UTC, TAI)
     # Equal runs give equal bytes: the day of the scan, not of the run.
-    day = datetime.fromtimestamp(head.start_ns // NS_PER_S, timezone.utc).timetuple()
-    count, second = head.counts
-    bounds = (end_m for ends_m in zip(head.high_m, head.low_m, strict=True) for end_m in ends_m)
+    day = datetime.fromtimestamp(scan.start_ns // NS_PER_S, timezone.utc).timetuple()
     fields = [
         *(b"LASF", 0, _WKT | (_STANDARD_TIME if is_standard else 0), b"", 1, 4),
         *(b"mlbatch", f"mlbatch {mlbatch.__version__}".encode()),
         *(day.tm_yday, day.tm_year),
         *(_HEADER.size, _HEADER.size + sum(map(len, vlrs)), len(vlrs)),
-        *(point_format, head.point_bytes, *[0] * 6),
-        *(*[head.scale_m] * 3, *head.offset_m, *bounds),
+        *(point_format, point_bytes, *[0] * 6),
+        *(SCALE_M, SCALE_M, SCALE_M, 0.0, 0.0, 0.0, *bounds),
         *(0, 0, 0, count, count - second, second, *[0] * 13),
     ]
     return b"".join([_HEADER.pack(*fields), *vlrs])
 
 
-def vlr(user: str, number: int, description: str, content: bytes) -> bytes:
+def _vlr(user: str, number: int, description: str, content: bytes) -> bytes:
     """Return a variable length record."""
     head = _VLR.pack(0, user.encode(), number, len(content), description.encode())
     return head + content
@@ -225,17 +189,10 @@ def _extra_bytes(records: memoryview, point_bytes: int) -> bytes:
     first: tuple[float, ...] = ()
     if len(records):
         first = _EXTRA_VALUES.unpack(bytes(records[:point_bytes]).ljust(_EXTRA_VALUES.size, b"\0"))
-    known = _EXTRA_BYTES if point_bytes == RECORD.step else _EXTRA_BYTES[:-1]
+    known = EXTRA_BYTES if point_bytes == RECORD.step else EXTRA_BYTES[:-1]
     parts = []
     for index, (name, kind, description, form) in enumerate(known):
         low, high = (first[index],) * 2 if first else _NO_EXTREMES[form]
         ends = (struct.pack(form, low), struct.pack(form, high))
         parts.append(_EXTRA.pack(kind, _HAS_EXTREMES, name.encode(), *ends, description.encode()))
     return b"".join(parts)
-
-
-def described(names: Sequence[str]) -> bytes:
-    """Return the descriptions of some of the extra bytes, without lowest and highest."""
-    known = {name: (kind, text) for name, kind, text, _ in _EXTRA_BYTES}
-    rows = ((known[name][0], name.encode(), known[name][1].encode()) for name in names)
-    return b"".join(_EXTRA.pack(kind, 0, name, b"", b"", text) for kind, name, text in rows)

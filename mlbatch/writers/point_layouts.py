@@ -7,7 +7,7 @@ by block, so that the strided writes of a block stay in the processor's cache.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import NamedTuple, TypeAlias
 
 import numpy as np
@@ -125,6 +125,39 @@ class Layout(NamedTuple):
             elif kind:
                 pieces.append(piece)
         return RecordLayout(self.step, tuple(pieces))
+
+    def ply_head(self, comments: Sequence[str], count: int) -> bytes:
+        """Return the header of a PLY file of `count` vertices."""
+        # Names of types as of 1994, which all readers know.
+        types = {"<f4": "float", "<f8": "double", "<i4": "int", "u1": "uchar"}
+        lines = [
+            "ply",
+            "format binary_little_endian 1.0",
+            *(f"comment {line}" for line in comments),
+            f"element vertex {count}",
+            *(f"property {types[field.dtype]} {field.name}" for field in self.fields),
+            "end_header",
+        ]
+        return ("\n".join(lines) + "\n").encode()
+
+    def pcd_head(self, comments: Sequence[str], width: int, height: int = 1) -> bytes:
+        """Return the header of a PCD file."""
+        types = [np.dtype(field.dtype) for field in self.fields]
+        lines = [
+            "# .PCD v0.7 - Point Cloud Data file format",
+            *(f"# {line}" for line in comments),
+            "VERSION 0.7",
+            f"FIELDS {' '.join(field.name for field in self.fields)}",
+            f"SIZE {' '.join(str(one.itemsize) for one in types)}",
+            f"TYPE {' '.join(one.kind.upper() for one in types)}",
+            f"COUNT {' '.join('1' for _ in types)}",
+            f"WIDTH {width}",
+            f"HEIGHT {height}",
+            "VIEWPOINT 0 0 0 1 0 0 0",
+            f"POINTS {width * height}",
+            "DATA binary",
+        ]
+        return ("\n".join(lines) + "\n").encode()
 
     def pack(self, scan: Scan, out: Records) -> None:
         """Fill `out`, records of this layout: (p,), or (slots, n) of an organized scan."""
@@ -353,6 +386,25 @@ PLY_LAYOUTS = {
     "cloudcompare": Layout("ply-cloudcompare", 30, (*_XYZ, *_SCALARS)),
     "float": Layout("ply-float", 16, _FLOATS),
 }
+# Of maps: what places a point is filled in by the writer, and the time is that of the clock.
+MAP_PLY = Layout(
+    "map-ply",
+    42,
+    (
+        *(Field(axis, "<f8", 8 * at) for at, axis in enumerate("xyz")),
+        *(_intensity(24), Field("time", "<f8", 28, ("stamp_f8", 0))),
+        *(Field("ring", "<i4", 36, ("ring_i4", 0)), _return_type(40), _lidar_id(41)),
+    ),
+)
+MAP_PCD = Layout(
+    "map-pcd",
+    28,
+    (
+        *(Field(axis, "<f4", 4 * at) for at, axis in enumerate("xyz")),
+        *(_intensity(12), Field("time", "<f8", 16, ("stamp_f8", 0))),
+        *(_ring(24), _return_type(26), _lidar_id(27)),
+    ),
+)
 # Rows of float32 alone: of KITTI, of nuScenes, and of its times.
 ROWS_KITTI = Layout("kitti", 16, (*_XYZ, _intensity(12)))
 ROWS_NUSCENES = Layout(

@@ -20,4 +20,4 @@ COMPRESSES = False
 
 def open_writer(target: Path, info: RunInfo, options: WriterOptions) -> ScanWriter:
     """Start a folder of LAZ files."""
-    return open_folder(FORMAT, target, info, options, load_lazrs("--format laz"))
+    return open_folder(FORMAT, target, info, options, load_lazrs())

@@ -19,9 +19,6 @@ FORMAT = "ply"
 SUFFIX: str | None = None
 COMPRESSES = False
 
-# Names of PLY types as of 1994, which all readers know.
-_TYPES = {"<f4": "float", "<f8": "double", "<i4": "int", "u1": "uchar"}
-
 
 def extras(options: WriterOptions) -> frozenset[str]:
     """Return nothing: the properties are fixed."""
@@ -50,16 +47,5 @@ class PlyEncoder:
     def encode(self, scan: Scan) -> list[Bytes]:
         """Return the header and all points as vertices."""
         packed = self._vertices.of(scan)
-        return [self._header(scan, packed.shape[0]).encode(), record_bytes(packed)]
-
-    def _header(self, scan: Scan, count: int) -> str:
-        """Return the header of a PLY file of `count` vertices."""
-        lines = [
-            "ply",
-            "format binary_little_endian 1.0",
-            *(f"comment {line}" for line in scan_comments(scan)),
-            f"element vertex {count}",
-            *(f"property {_TYPES[field.dtype]} {field.name}" for field in self._layout.fields),
-            "end_header",
-        ]
-        return "\n".join(lines) + "\n"
+        head = self._layout.ply_head(scan_comments(scan), packed.shape[0])
+        return [head, record_bytes(packed)]
