@@ -316,30 +316,14 @@ CONVERT: Final = (
         "accumulate",
         PATH,
         "Output",
-        "Also, or without -o only, write one cloud of all scans, placed by the poses of --deskew "
-        "FILE.tum: a .laz, .las, .ply or .pcd file.",
+        "A map: one cloud of all scans, by --deskew FILE.tum (.laz, .las, .ply, .pcd).",
         metavar="MAP",
         in_rig=False,
     ),
     Option(
-        "voxel",
-        NUMBER,
-        "Output",
-        "Of the map: only the first point in each cube of M m.  [default: all points]",
-        default=0.0,
-        metavar="M",
-        low=0,
-        in_rig=False,
-        shown_default=False,
+        "voxel", NUMBER, "Output", "Of the map: one point per cube, m.", metavar="M", in_rig=False
     ),
-    Option(
-        "crs",
-        TEXT,
-        "Output",
-        "Of the map: coordinate system of the poses, as EPSG:32633.",
-        metavar="EPSG:N",
-        in_rig=False,
-    ),
+    Option("crs", TEXT, "Output", "Of the map: its system.", metavar="EPSG:N", in_rig=False),
     Option(
         "report",
         PATH,

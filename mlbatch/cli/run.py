@@ -30,9 +30,6 @@ from mlbatch.pipeline.output import Output, OutputRequest
 from mlbatch.report.report import RunReport, report_of, report_text
 from mlbatch.writers import discard, report_paths
 
-# Of maps.
-MAP_SUFFIXES = (".laz", ".las", ".ply", ".pcd")
-
 # Loaded where it is needed: a dry run has no files.
 if TYPE_CHECKING:
     from mlbatch.pipeline.files import Files
@@ -116,11 +113,8 @@ def _print_summary(
     if target.verbose:
         _print_sensors(conversion)
     print_summary(inputs)
-    if target.written is not None:
-        typer.echo(one_line(f"wrote {target.written}, report {report_path}"))
-    if target.map is not None:
-        report = f", report {report_path}" if target.written is None else ""
-        typer.echo(one_line(f"wrote {target.map}{report}"))
+    if written := [str(path) for path in (target.written, target.map) if path is not None]:
+        typer.echo(one_line(f"wrote {' and '.join(written)}, report {report_path}"))
 
 
 def _beyond_limits_before(target: Target, name: str) -> list[str]:
@@ -303,7 +297,7 @@ def _numbered(target: Target, number: int) -> Target:
     request = target.request._replace(
         output=_with_number(target.request.output, number, ".mcap", ".bag"),
         report=_with_number(target.request.report, number, ".json"),
-        accumulate=_with_number(target.request.accumulate, number, *MAP_SUFFIXES),
+        accumulate=_with_number(target.map, number, target.map.suffix if target.map else ""),
     )
     return target._replace(request=request, html=_with_number(target.html, number, ".html"))
 

@@ -37,7 +37,6 @@ if TYPE_CHECKING:
     from mlbatch.pipeline.constant_velocity import ConstantVelocity
     from mlbatch.pipeline.deskew import Deskew, PoseSource
     from mlbatch.pipeline.pose_check import PoseCheck
-    from mlbatch.report.map_figures import MapFigures
 
 # Called with the bytes read so far, the bytes of all recordings, and the scans so far.
 Progress = Callable[[int, int, int], None]
@@ -112,10 +111,10 @@ class SkippedWindow(NamedTuple):
 class Conversion:
     """One run: `windows`, `tasks` or `scans` drive it, `close` ends it.
 
-    info, table: None before the first window; poses: known once closed; map: of `--accumulate`,
-    known at the end; dropped_incomplete: windows left out by `--drop-incomplete`;
-    notes_before_points: number of warnings that precede those about points; users, imu_users: of
-    raw packets and of samples of IMUs, besides the run itself.
+    info, table: None before the first window; poses: known once closed; dropped_incomplete:
+    windows left out by `--drop-incomplete`; notes_before_points: number of warnings that precede
+    those about points; users, imu_users: of raw packets and of samples of IMUs, besides the run
+    itself.
     """
 
     def __init__(self, job: Job, buffers: int = 1, progress: Progress | None = None) -> None:
@@ -171,7 +170,6 @@ class Conversion:
         self.imu_users: list[ImuUser] = [] if self.deskew is None else [self.deskew]
         self.poses = PoseFigures(ONE_LIDAR if job.checks_poses else NOT_ASKED)
         self.pose_check = self._new_pose_check()
-        self.map: MapFigures | None = None
         self._buffers = buffers
         self._pool: DecodePool | None = None
         if job.max_wait_ns is None:

@@ -43,11 +43,9 @@ from mlbatch.writers import (
 # Loaded where it is needed: a dry run has no files.
 if TYPE_CHECKING:
     from mlbatch.pipeline.files import Files
-    from mlbatch.writers.map_writer import MapRequest
+    from mlbatch.writers.map_writer import MapWriter
 
 Listener = Callable[[str], None]
-# Arrays of scans that LAS stores.
-MAP_EXTRAS = frozenset({"reflectivity"})
 
 
 class OutputRequest(NamedTuple):
@@ -59,7 +57,7 @@ class OutputRequest(NamedTuple):
     compression: str = "none"
     ply_style: str = "standard"
     accumulate: Path | None = None  # a map
-    voxel: float = 0.0  # m, of the map; 0: all points
+    voxel: float | None = None  # m, of the map; None: all points
     crs: str | None = None  # of the map
     dry_run: bool = False
     jobs: int | None = None  # None: auto
@@ -87,6 +85,7 @@ class Output:
         self.files: Files | None = None
         self.report_path = request.report
         self.is_complete = False
+        self._map: MapWriter | None = None
         self._request = request
         self._say = say
         options = WriterOptions(
@@ -104,44 +103,34 @@ class Output:
             from mlbatch.pipeline.shards import check_format
 
             check_format(self.format, options)
+        if (request.accumulate, request.voxel, request.crs) != (None, None, None):
+            from mlbatch.pipeline.accumulate import check_map
+
+            check_map(job, request)
         path = request.written
         jobs = request.jobs or 1 if path is None else jobs_for(request.jobs, self.format, options)
         self.job = replace(job, extras=extras(self.format, options), jobs=jobs)
         self._options = options
-        self._map = self._map_of(job)
-        if self._map is not None:
-            # Of a map, which takes arrays; also next to scans.
-            scans = frozenset[str]() if path is None else self.job.extras
-            self.job = replace(self.job, extras=scans | MAP_EXTRAS)
         if path is not None:
-            if self._map is None:
-                self.job = replace(self.job, record=record_layout(self.format, options))
+            self.job = replace(self.job, record=record_layout(self.format, options))
             preflight.check_output(self.job, path, self.format)
             if request.resume and self._was_completed(path):
                 self.is_complete = True
                 return
             self._prepare(path, warn)
+        accumulated = request.accumulate
+        if path is None and accumulated is not None and not request.dry_run:
+            self.report_path = self.report_path or side_path(accumulated, REPORT_JSON)
         preflight.check_report(self.job, self.report_path, path, self.format)
+        if accumulated is not None and not request.dry_run:
+            from mlbatch.writers.map_writer import MapWriter
 
-    def _map_of(self, job: Job) -> MapRequest | None:
-        """The map that is to be written, checked; None without, and in a dry run."""
-        request = self._request
-        if request.accumulate is None:
-            if request.voxel or request.crs:
-                raise UsageError(
-                    f"{'--voxel' if request.voxel else '--crs'}: expected --accumulate MAP, found "
-                    "none; leave it out, or write --accumulate map.laz"
-                )
-            return None
-        from mlbatch.pipeline.accumulate import check_map, map_of
-
-        found = map_of(job, request, request.accumulate)
-        if request.dry_run:
-            return None
-        check_map(job, found, request.written)
-        if request.written is None and self.report_path is None:
-            self.report_path = side_path(found.path, REPORT_JSON)
-        return found
+            self._map = MapWriter(
+                accumulated, request.voxel or 0.0, request.crs, request.overwrite, request.fsync
+            )
+            # A map takes arrays, also of what only LAS stores.
+            names = self.job.extras | {"reflectivity"}
+            self.job = replace(self.job, extras=names, record=None)
 
     def _prepare(self, path: Path, warn: Listener) -> None:
         """Take the files of an interrupted run, or check that all can be made from the start."""
@@ -169,25 +158,21 @@ class Output:
 
     def make(self, progress: Progress | None = None) -> tuple[Conversion, RunReport]:
         """Convert, write the output and its report; returns the run and what the report has."""
-        path, accumulated = self._request.written, self._map
-        if path is None and accumulated is None:
+        path = self._request.written
+        if path is None and self._map is None:
             run, report = convert(self.job, None, progress)
             report = self._completed(report)
             if self.report_path is not None:
                 write_text(self.report_path, report_text(report))
             return run, report
         open_scans = None if path is None else partial(self._open, path)
-        open_map = None
-        if accumulated is not None:
-            from mlbatch.writers.map_writer import MapWriter
-
-            open_map = partial(MapWriter, accumulated)
-        run, report = convert(self.job, open_scans, progress, self.files, self._finish, open_map)
+        run, report = convert(self.job, open_scans, progress, self.files, self._finish, self._map)
         return run, self._completed(report)
 
     def _completed(self, report: RunReport) -> RunReport:
         """The report with the command line and, of an output, what made it."""
-        report = report._replace(command=self._request.command)
+        figures = None if self._map is None else self._map.figures
+        report = report._replace(command=self._request.command, map=figures)
         if self.files is None or self.files.is_shard:
             return report
         from mlbatch.pipeline.job_identity import identity_of_parts

@@ -73,9 +73,8 @@ def _own_files(output: Path, name: str) -> list[Path]:
 
 def _read_by(job: Job) -> list[Path]:
     """All files that a job names as input."""
-    trajectory = Path(job.deskew)
-    poses = [trajectory] if job.deskew and trajectory.is_file() else []
-    return [*job.recordings, *job.selection.metadata, *filter(None, [job.selection.rig]), *poses]
+    others = [job.selection.rig or Path(), Path(job.deskew)]
+    return [*job.recordings, *job.selection.metadata, *filter(Path.is_file, others)]
 
 
 def check_disk(job: Job, output: Path) -> str:

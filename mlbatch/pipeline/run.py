@@ -29,7 +29,6 @@ from mlbatch.writers import FilesWriter, ScanJob, ScanWriter
 
 if TYPE_CHECKING:
     from mlbatch.pipeline.files import Files
-    from mlbatch.writers.map_writer import MapWriter
 
 OpenWriter = Callable[[RunInfo], ScanWriter]
 # Called with the content of the report and the complete output, before that gets its final name.
@@ -50,25 +49,26 @@ def convert(
     progress: Progress | None = None,
     files: Files | None = None,
     last: Last | None = None,
-    open_map: Callable[[RunInfo], MapWriter] | None = None,
+    map_writer: ScanWriter | None = None,
 ) -> tuple[Conversion, RunReport]:
     """Run a job; returns the run and the content of its report.
 
-    open_writer: None where no scans are written; files: of the output; open_map: for a map.
+    open_writer: of scans, None without; files: of the output; map_writer: of `--accumulate`.
     """
     # One scan more than are waiting to be written: the one that is being decoded.
-    decodes_ahead = job.jobs == 1 and not (open_writer is None and open_map is None)
+    decodes_ahead = job.jobs == 1 and not (open_writer is None and map_writer is None)
     run = Conversion(job, buffers=_AHEAD + 1 if decodes_ahead else 1, progress=progress)
     _return_freed_memory()
     if files is not None:
         files.join(run)
-    output = _Output(run, open_writer, files, open_map)
+    output = _Output(run, open_writer, files)
+    output.writers += [] if map_writer is None else [map_writer]
     try:
         output.make(progress)
         run.close()
         if files is not None:
             files.complete()
-        inputs = _finish(run, output.writers, output.map, last)
+        inputs = _finish(run, output.writers, last)
         output.writers = []
     except NoScanError:
         if output.abandon() and files is not None:
@@ -82,24 +82,14 @@ def convert(
 
 
 class _Output:
-    """The output under construction.
-
-    writers: of scans, then of the map; none before the first scan, and in a dry run.
-    """
+    """The output under construction; writers: of scans, from the first one on, and of a map."""
 
     def __init__(
-        self,
-        run: Conversion,
-        open_writer: OpenWriter | None,
-        files: Files | None,
-        open_map: Callable[[RunInfo], MapWriter] | None,
+        self, run: Conversion, open_writer: OpenWriter | None, files: Files | None
     ) -> None:
         self.writers: list[ScanWriter] = []
-        self.map: MapWriter | None = None
         self._run = run
         self._open_writer = open_writer
-        self._open_map = open_map
-        self._is_dry = open_writer is None and open_map is None
         self._files = files
         self._idle: list[DecodeWorker] = []
         self._is_begun = False
@@ -118,7 +108,7 @@ class _Output:
             for scan_task in itertools.chain.from_iterable(map(self._scan_tasks, tasks)):
                 if jobs == 1:
                     scan_task.decode_with(run.pool.workers[0])
-                if jobs == 1 and self._is_dry:
+                if jobs == 1 and not self.writers:
                     # Nothing to write that another thread could do meanwhile.
                     run_inline(scan_task)
                 else:
@@ -130,7 +120,7 @@ class _Output:
         task = None if isinstance(item, SkippedWindow) else item
         before: Sequence[ImuSamples | Message] = ()
         # A dry run only counts messages, so it need not cut them at every window.
-        if not self._is_dry or item.end_ns >= self._passed_ns + _DRY_NS:
+        if self._open_writer or self.writers or item.end_ns >= self._passed_ns + _DRY_NS:
             self._passed_ns = item.end_ns
             before = self._run.passed_through(item.end_ns, _PORTION_BYTES)
         # After nothing there is no more.
@@ -166,14 +156,11 @@ class _Output:
             return
         self._is_begun = True
         self._idle.extend(self._run.pool.workers)
-        info = self._run.info
-        if self._open_writer is not None and info is not None:
-            self.writers.append(self._open_writer(info))
-            if self._files is not None and isinstance(self.writers[0], FilesWriter):
+        if self._open_writer is not None and self._run.info is not None:
+            writer = self._open_writer(self._run.info)
+            self.writers.insert(0, writer)
+            if self._files is not None and isinstance(writer, FilesWriter):
                 self._files.begin()
-        if self._open_map is not None and info is not None:
-            self.map = self._open_map(info)
-            self.writers.append(self.map)
 
     def abandon(self) -> bool:
         """Close an output that is not complete, if there is one; returns whether there was."""
@@ -191,9 +178,7 @@ def _write_chunks(job: ScanJob) -> None:
     job.commit()
 
 
-def _finish(
-    run: Conversion, writers: Sequence[ScanWriter], map_writer: MapWriter | None, last: Last | None
-) -> RunReport:
+def _finish(run: Conversion, writers: Sequence[ScanWriter], last: Last | None) -> RunReport:
     """Write the last messages, check the ledgers and complete the output."""
     began_s = time.perf_counter()
     while items := run.passed_through(None, _PORTION_BYTES):
@@ -201,8 +186,6 @@ def _finish(
             forward(item, writers)
         for writer in writers:
             _write_chunks(writer.flush())
-    if map_writer is not None:
-        run.map = map_writer.figures
     for note in run_report.message_notes(run):
         run.warn(note)
     inputs = run_report.run_report(run)
@@ -224,7 +207,6 @@ def _finish(
     summary = Summary(run.batcher.t_init_ns, report, table, fill_totals(inputs))
     for writer in writers[1:]:
         writer.finish(summary)
-    # The report is written before the scans have their name, or a map that is alone.
     writers[0].finish(summary, complete)
     return inputs
 

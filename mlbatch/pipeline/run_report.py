@@ -57,7 +57,6 @@ def run_report(run: Conversion) -> RunReport:
         variants=run.job.variants,
         deskew=None if run.deskew is None else run.deskew.ledger,
         poses=run.poses,
-        map=run.map,
         capture=_capture(run),
         sensors=tuple(_sensor(run, sensor) for sensor in run.sensors),
         scans=_NO_SCANS

@@ -48,7 +48,8 @@ class ScanTask:
         self._decoded: Decoded | None = None
         self._decode_s = 0.0
         self._write_s = 0.0
-        self._jobs: Sequence[ScanJob] = ()
+        # That of the scans comes first, and has the checksum.
+        self._jobs = [ScanJob()]
 
     def decode_with(self, worker: DecodeWorker) -> None:
         """Decode in this thread, so that only writing is left for others."""
@@ -64,14 +65,15 @@ class ScanTask:
         if self._decoded is None and self._task is not None:
             self._worker = self._idle.pop()
             self.decode_with(self._worker)
-        self._jobs = [self._writer_job(writer) for writer in self._writers]
+        if self._writers:
+            self._jobs = [self._writer_job(writer) for writer in self._writers]
         self._timed(lambda job: job.pack())
 
     def append(self) -> None:
         """Count the scan, write what precedes it, reserve its place in the output. In order."""
         if self._decoded is not None:
             scan = self._decoded.scan
-            checksum = self._checksum if self._kept is None else self._kept.checksum
+            checksum = self._jobs[0].checksum if self._kept is None else self._kept.checksum
             is_listed = self._files is None or self._files.is_listed(scan)
             self._run.account(scan, checksum, is_listed)
         if self._index is not None:
@@ -90,7 +92,7 @@ class ScanTask:
         if self._task is not None and self._decoded is not None and self._files is not None:
             scan, outcomes = self._decoded
             if self._kept is None:
-                self._files.note(scan, self._task.only, outcomes, self._checksum)
+                self._files.note(scan, self._task.only, outcomes, self._jobs[0].checksum)
         self._timed(lambda job: job.commit())
         self._run.stages.write_s += self._write_s
         self._run.stages.decode_s += self._decode_s
@@ -104,11 +106,6 @@ class ScanTask:
         if self._kept is not None and isinstance(writer, FilesWriter):
             return writer.skip(self._decoded.scan, self._task.only)
         return writer.write(self._decoded.scan, self._task.only)
-
-    @property
-    def _checksum(self) -> int | None:
-        """That of the scan in the output, which comes first."""
-        return self._jobs[0].checksum if self._jobs else None
 
     def _timed(self, stage: Callable[[ScanJob], None]) -> None:
         began_s = time.perf_counter()

@@ -152,7 +152,7 @@ class OutputOptions(TypedDict, total=False):
     ply_style: str
     max_bag_duration: float  # s of recording in a file of a bag; 0: all in one file
     accumulate: AnyPath | None  # a map; with output None, the map alone
-    voxel: float  # m, of the map
+    voxel: float | None  # m, of the map
     crs: str | None  # of the map, as EPSG:32633
     overwrite: bool
     fsync: bool  # wait until the output is on the disk

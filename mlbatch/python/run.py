@@ -117,7 +117,7 @@ def run_job(job: Job, path: Path | None, options: OutputOptions) -> Run:
         jobs=jobs,
         report=report,
         accumulate=accumulate,
-        voxel=options.get("voxel", 0.0),
+        voxel=options.get("voxel"),
         crs=options.get("crs"),
         overwrite=options.get("overwrite", False),
         fsync=options.get("fsync", True),

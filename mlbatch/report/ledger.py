@@ -144,11 +144,6 @@ def check_messages(topic: str, read: int, written: int, dropped: dict[str, int])
     return _balance(f"messages of {topic}", read, (written, *dropped.values()))
 
 
-def check_map(points: int, kept: int, thinned: int) -> list[str]:
-    """Imbalance between the points of scans and those of their map, as a line."""
-    return _balance("points of the map", points, (kept, thinned))
-
-
 def ordered(counts: dict[str, int], reasons: tuple[str, ...]) -> dict[str, int]:
     """The counted reasons, in the order of their closed list."""
     listed = {reason: counts[reason] for reason in reasons if counts.get(reason)}

@@ -21,8 +21,7 @@ class MapFigures:
 
     def describe(self) -> str:
         """A line of the summary."""
-        sizes = (high - low for low, high in zip(self.low_m, self.high_m, strict=True))
-        extent = " x ".join(f"{size_m:.1f}" for size_m in sizes)
+        ends = zip(self.low_m, self.high_m, strict=True)
+        extent = " x ".join(f"{high - low:.1f}" for low, high in ends)
         thinned = f" ({self.thinned} more in the same {self.voxel_m:g} m)" if self.voxel_m else ""
-        crs = f", {self.crs}" if self.crs else ""
-        return f"map of {self.scans} scans: {self.points} points{thinned}, {extent} m{crs}"
+        return f"map of {self.scans} scans: {self.points} points{thinned}, {extent} m {self.crs}"

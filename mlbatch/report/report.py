@@ -22,7 +22,6 @@ from mlbatch.report.ledger import (
     SensorLedger,
     check_capture,
     check_datagrams,
-    check_map,
     check_messages,
     ordered,
 )
@@ -301,8 +300,6 @@ def imbalances(run: RunReport) -> list[str]:
     lines += check_datagrams(run.capture.datagrams + run.repeated, ledgers, unassigned)
     for sensor in run.sensors:
         lines += [f"{sensor.name}: {line}" for line in sensor.ledger.check()]
-    if run.map is not None:
-        lines += check_map(run.scans.points, run.map.points, run.map.thinned)
     for one in run.messages:
         lines += check_messages(one.topic, one.read, one.written, one.dropped)
     return lines

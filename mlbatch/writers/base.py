@@ -102,15 +102,15 @@ class ScanWriter(Protocol):
 
     def flush(self) -> ScanJob:
         """Return the job that writes complete chunks of messages where no scan follows them."""
-        ...
+        return ScanJob()
 
     def write_imu(self, samples: ImuSamples) -> None:
         """Write IMU samples; formats without IMU ignore the call."""
-        ...
+        return
 
     def write_message(self, message: Message) -> None:
         """Forward a recorded message unchanged; formats without messages ignore the call."""
-        ...
+        return
 
     def finish(self, summary: Summary, last: Callable[[Path], None] | None = None) -> None:
         """Complete the output and move it to its final path.

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib
-from collections.abc import Sequence
 from typing import Any
 
 from mlbatch.errors import RigError, UsageError, install_extra
@@ -29,7 +28,8 @@ class MapCrs:
         # pyproj may come without types.
         try:
             crs: Any = pyproj.CRS.from_epsg(code)
-            self.wkt = str(crs.to_wkt("WKT1_GDAL"))
+            # OGC 01-009 (WKT 1), which ends with a zero in LAS.
+            self.wkt = crs.to_wkt("WKT1_GDAL").encode() + b"\0"
         except pyproj.exceptions.CRSError as err:
             raise UsageError(
                 f"--crs: expected a known EPSG:NNNN, found {name!r}; write --crs EPSG:32633"
@@ -37,17 +37,16 @@ class MapCrs:
         self.name = f"EPSG:{code}"
         plane = crs.sub_crs_list[0] if crs.is_compound else crs
         if not plane.is_projected or {axis.unit_name for axis in crs.axis_info} != {"metre"}:
+            found = f"{plane.type_name} in {crs.axis_info[0].unit_name} ({crs.name})"
             raise UsageError(
-                "--crs: expected a projected system in metres, as poses are, found "
-                f"{plane.type_name} in {crs.axis_info[0].unit_name} ({crs.name}); give that of the "
+                f"--crs: expected a projected system in metres, found {found}; give that of the "
                 "poses"
             )
         self._area = crs.area_of_use
         self._to_degrees = pyproj.Transformer.from_crs(plane, plane.geodetic_crs, always_xy=True)
 
-    def check(self, position_m: Sequence[float]) -> None:
-        """RigError for a position that is far from where the system is used."""
-        x, y = position_m[:2]
+    def check(self, x: float, y: float) -> None:
+        """RigError for a position in m that is far from where the system is used."""
         east, north = self._to_degrees.transform(x, y)
         wider, higher = (0.0, 0.0) if max(abs(x), abs(y)) < _LOCAL_M else _BEYOND_DEG
         area = self._area
@@ -57,6 +56,5 @@ class MapCrs:
         if not (is_known and (east - area.west + wider) % 360.0 <= width + 2.0 * wider):
             raise RigError(
                 f"--crs {self.name}: expected poses with eastings and northings of {area.name}, "
-                f"found x {x:.1f}, y {y:.1f} m ({east:.1f}, {north:.1f} degrees); give the system "
-                "of the poses, or leave it out for a local frame"
+                f"found x {x:.1f}, y {y:.1f} m; give their system, or none for a local frame"
             )

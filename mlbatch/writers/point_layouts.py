@@ -129,7 +129,7 @@ class Layout(NamedTuple):
     def ply_head(self, comments: Sequence[str], count: int) -> bytes:
         """Return the header of a PLY file of `count` vertices."""
         # Names of types as of 1994, which all readers know.
-        types = {"<f4": "float", "<f8": "double", "<i4": "int", "u1": "uchar"}
+        types = {"<f4": "float", "<f8": "double", "<i4": "int", "<u2": "ushort", "u1": "uchar"}
         lines = [
             "ply",
             "format binary_little_endian 1.0",
@@ -386,25 +386,23 @@ PLY_LAYOUTS = {
     "cloudcompare": Layout("ply-cloudcompare", 30, (*_XYZ, *_SCALARS)),
     "float": Layout("ply-float", 16, _FLOATS),
 }
-# Of maps: what places a point is filled in by the writer, and the time is that of the clock.
-MAP_PLY = Layout(
-    "map-ply",
-    42,
-    (
-        *(Field(axis, "<f8", 8 * at) for at, axis in enumerate("xyz")),
-        *(_intensity(24), Field("time", "<f8", 28, ("stamp_f8", 0))),
-        *(Field("ring", "<i4", 36, ("ring_i4", 0)), _return_type(40), _lidar_id(41)),
-    ),
-)
-MAP_PCD = Layout(
-    "map-pcd",
-    28,
-    (
-        *(Field(axis, "<f4", 4 * at) for at, axis in enumerate("xyz")),
-        *(_intensity(12), Field("time", "<f8", 16, ("stamp_f8", 0))),
-        *(_ring(24), _return_type(26), _lidar_id(27)),
-    ),
-)
+
+
+def _map_layout(name: str, kind: str, end: int) -> Layout:
+    """Points of a map: times are those of the clock; kind: of x, y and z, which end at a byte.
+
+    The writer fills in where they are.
+    """
+    fields = (
+        *(Field(axis, kind, at * end // 3) for at, axis in enumerate("xyz")),
+        *(_intensity(end), Field("time", "<f8", end + 4, ("stamp_f8", 0))),
+        *(_ring(end + 12), _return_type(end + 14), _lidar_id(end + 15)),
+    )
+    return Layout(name, end + 16, fields)
+
+
+MAP_PLY = _map_layout("map-ply", "<f8", 24)
+MAP_PCD = _map_layout("map-pcd", "<f4", 12)
 # Rows of float32 alone: of KITTI, of nuScenes, and of its times.
 ROWS_KITTI = Layout("kitti", 16, (*_XYZ, _intensity(12)))
 ROWS_NUSCENES = Layout(

@@ -1,17 +1,36 @@
-"""Metadata of a scan as lines of text, for formats whose headers have comments."""
+"""Files of records: metadata of a scan as lines of text, for headers that have comments."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import numpy as np
 
 import mlbatch
 from mlbatch.errors import one_line
 from mlbatch.types import Scan
+from mlbatch.writers.output_file import Bytes
+from mlbatch.writers.point_layouts import Layout, ScanRecords, record_bytes
 
 # Fields in the units of all formats with seconds after the start of the scan.
 UNITS = "x y z m; time s after start_ns; intensity as sent by the sensor"
+
+
+class RecordEncoder:
+    """Encodes scans as the records of a layout."""
+
+    def __init__(self, layout: Layout, head: Callable[..., bytes] | None = None) -> None:
+        """head: of comments, width and, of organized scans, height; None: there is none."""
+        self._records = ScanRecords(layout)
+        self._head = head
+
+    def encode(self, scan: Scan) -> list[Bytes]:
+        """Return the header and all points; an organized scan has a row for each slot."""
+        packed = self._records.of(scan)
+        *height, width = packed.shape
+        head = () if self._head is None else [self._head(scan_comments(scan), width, *height)]
+        return [*head, record_bytes(packed)]
 
 
 def scan_comments(scan: Scan, units: str = UNITS) -> list[str]:

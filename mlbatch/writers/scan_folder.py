@@ -8,11 +8,13 @@ from pathlib import Path
 from typing import NamedTuple, Protocol
 
 from mlbatch.errors import UsageError
-from mlbatch.types import ImuSamples, Message, RunInfo, Scan, Summary
+from mlbatch.types import RunInfo, Scan, Summary
+from mlbatch.units import NS_PER_S
 from mlbatch.writers.atomic import SCANS_CSV, export_errors, prepare
 from mlbatch.writers.base import (
     CHECKSUMS,
     DEFAULT_POINT_LAYOUT,
+    FilesWriter,
     ScanJob,
     WriterOptions,
 )
@@ -23,6 +25,8 @@ from mlbatch.writers.output_file import (
     take_scratch,
     write_summed,
 )
+
+TIMES_TXT = "times.txt"
 
 
 class Encoder(Protocol):
@@ -62,7 +66,14 @@ class Entry:
     start_ns: int
 
 
-class FolderWriter:
+def times_text(entries: Sequence[Entry]) -> str:
+    """Return one line per scan: its start in seconds of the common clock, with 9 decimals."""
+    return "".join(
+        f"{entry.start_ns // NS_PER_S}.{entry.start_ns % NS_PER_S:09d}\n" for entry in entries
+    )
+
+
+class FolderWriter(FilesWriter):
     """Writes each scan to a file of its own."""
 
     def __init__(
@@ -110,16 +121,6 @@ class FolderWriter:
         """Return a job without work: another run has made the file, or makes it."""
         self._paths(scan, sensor)
         return ScanJob()
-
-    def flush(self) -> ScanJob:
-        """Return a job without work: only scans are written."""
-        return ScanJob()
-
-    def write_imu(self, samples: ImuSamples) -> None:
-        """Ignore IMU samples."""
-
-    def write_message(self, message: Message) -> None:
-        """Ignore messages."""
 
     def finish(self, summary: Summary, last: Callable[[Path], None] | None = None) -> None:
         """Add lists and scans.csv, and move the folder to its final path."""

@@ -10,9 +10,9 @@ from pathlib import Path
 
 from mlbatch.types import RecordLayout, RunInfo
 from mlbatch.writers.base import ScanWriter, WriterOptions
-from mlbatch.writers.float_rows import TIMES_TXT, RowEncoder, times_text
 from mlbatch.writers.point_layouts import ROWS_KITTI
-from mlbatch.writers.scan_folder import FolderWriter, check_dense
+from mlbatch.writers.scan_comments import RecordEncoder
+from mlbatch.writers.scan_folder import TIMES_TXT, FolderWriter, check_dense, times_text
 
 FORMAT = "kitti"
 SUFFIX: str | None = None
@@ -39,7 +39,7 @@ def open_writer(target: Path, info: RunInfo, options: WriterOptions) -> ScanWrit
         info,
         options,
         FORMAT,
-        lambda: RowEncoder(ROWS_KITTI),
+        lambda: RecordEncoder(ROWS_KITTI),
         suffix=suffix,
         lists={TIMES_TXT: times_text},
     )

@@ -12,9 +12,9 @@ from pathlib import Path
 
 from mlbatch.types import RunInfo
 from mlbatch.writers.base import ScanWriter, WriterOptions
-from mlbatch.writers.float_rows import TIMES_TXT, RowEncoder, times_text
 from mlbatch.writers.point_layouts import ROWS_NUSCENES, ROWS_TIME
-from mlbatch.writers.scan_folder import FolderWriter, check_dense
+from mlbatch.writers.scan_comments import RecordEncoder
+from mlbatch.writers.scan_folder import TIMES_TXT, FolderWriter, check_dense, times_text
 
 FORMAT = "nuscenes"
 SUFFIX: str | None = None
@@ -36,8 +36,8 @@ def open_writer(target: Path, info: RunInfo, options: WriterOptions) -> ScanWrit
         info,
         options,
         FORMAT,
-        lambda: RowEncoder(ROWS_NUSCENES),
+        lambda: RecordEncoder(ROWS_NUSCENES),
         suffix=points,
-        others={times: lambda: RowEncoder(ROWS_TIME)},
+        others={times: lambda: RecordEncoder(ROWS_TIME)},
         lists={TIMES_TXT: times_text},
     )

@@ -6,13 +6,13 @@ section 6. Field names are those of PCL's point types; lines that begin with # a
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 
-from mlbatch.types import RecordLayout, RunInfo, Scan
+from mlbatch.types import RecordLayout, RunInfo
 from mlbatch.writers.base import DEFAULT_POINT_LAYOUT, ScanWriter, WriterOptions
-from mlbatch.writers.output_file import Bytes
-from mlbatch.writers.point_layouts import CLOUD_LAYOUTS, ScanRecords, record_bytes
-from mlbatch.writers.scan_comments import scan_comments
+from mlbatch.writers.point_layouts import CLOUD_LAYOUTS
+from mlbatch.writers.scan_comments import RecordEncoder
 from mlbatch.writers.scan_folder import FolderWriter
 
 FORMAT = "pcd"
@@ -35,18 +35,5 @@ def record_layout(options: WriterOptions) -> RecordLayout | None:
 
 def open_writer(target: Path, info: RunInfo, options: WriterOptions) -> ScanWriter:
     """Start a folder of PCD files."""
-    return FolderWriter(target, info, options, FORMAT, PcdEncoder)
-
-
-class PcdEncoder:
-    """Encodes scans as a header and records."""
-
-    def __init__(self) -> None:
-        self._records = ScanRecords(_LAYOUT)
-
-    def encode(self, scan: Scan) -> list[Bytes]:
-        """Return the header and all points; an organized scan has a row for each slot."""
-        packed = self._records.of(scan)
-        *height, width = packed.shape
-        head = _LAYOUT.pcd_head(scan_comments(scan), width, *height)
-        return [head, record_bytes(packed)]
+    encoder = partial(RecordEncoder, _LAYOUT, _LAYOUT.pcd_head)
+    return FolderWriter(target, info, options, FORMAT, encoder)
