@@ -235,7 +235,7 @@ def _inputs(match: str, rig_of: Callable[[], str | None]) -> tuple[str, ...]:
         # A folder without recordings and without a rig is no session.
         with contextlib.suppress(UsageError):
             rig = read_rig(rig_of(), (match,))
-    sweeps = () if rig is None else [one.sweeps.glob for one in rig.sensors if one.sweeps]
+    sweeps = () if rig is None else [one.sweeps.paths for one in rig.sensors if one.sweeps]
     is_of_sweeps = any(next(path.glob(pattern), None) is not None for pattern in sweeps)
     return (match,) if is_of_sweeps else found
 

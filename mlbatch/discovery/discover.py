@@ -202,7 +202,10 @@ def discover(
     noted = [kind for kind in lidar_kinds if not _is_ignored(sampler, ignored, kind)]
     notes: list[Note] = []
     if rig is not None and rig.dataset is not None:
-        notes.append(Note("dataset", "", f"{rig.dataset.title}: recipe {rig.dataset.caution}"))
+        files = dict.fromkeys(str(file) for one in rig.sensors for file in one.extrinsics_files)
+        poses = f"; poses of {', '.join(files)}" if files else ""
+        text = f"{rig.dataset.title}: recipe {rig.dataset.caution}{poses}"
+        notes.append(Note("dataset", "", text))
     if rig is None:
         unmatched = _unmatched(sampler, matched, noted, examined, _names(examined, recorded))
         if to_convert:

@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 from mlbatch.errors import UsageError
 from mlbatch.rig.keys import Key
-from mlbatch.rig.rig import DATASET
+from mlbatch.rig.rig import DATASET, STAMP
 from mlbatch.rig.yaml_tree import Node, read_yaml
 
 FOLDER = Path(__file__).parents[1] / "datasets"
@@ -27,7 +27,6 @@ _TEXT = re.compile(r"\S(.*\S)?")
 _PAGE = re.compile(r"https?://\S+")
 # Folders, with those above a recording, in which a dataset may have its calibration.
 _LEVELS = 3
-_NAMED_PART = re.compile(r"\{stamp[^}]*\}")
 
 
 class Dataset(NamedTuple):
@@ -184,9 +183,7 @@ def by_topics(topics: Collection[str]) -> list[str]:
 
 def by_files(folder: Path) -> list[str]:
     """Datasets whose files of sweeps are in a folder, those with the most lidars first."""
-    return _with_most(
-        "points", "glob", 1, lambda glob: any(folder.glob(_NAMED_PART.sub("*", glob)))
-    )
+    return _with_most("points", "glob", 1, lambda glob: any(folder.glob(STAMP.sub("*", glob))))
 
 
 def _with_most(

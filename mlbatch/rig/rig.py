@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from fractions import Fraction
@@ -23,6 +24,8 @@ DEFAULT_BODY_FRAME = "base_link"
 MAX_NAME = 100
 # Key of the facts about a public dataset, in its recipe.
 DATASET = "dataset"
+# The time in the name of a file of sweeps, with its unit.
+STAMP = re.compile(r"\{stamp(?::(\w+))?\}")
 # Fields of `StreamSelector`, and keys of `stream` in the file.
 STREAM_FIELDS = ("source_ip", "port", "topic", "serial", "frame_id", "lidar_id")
 
@@ -75,6 +78,11 @@ class Sweeps(NamedTuple):
     fields: tuple[tuple[str, str], ...]
     place: str = ""
     arrays: tuple[tuple[str, str], ...] = ()
+
+    @property
+    def paths(self) -> str:
+        """The pattern for paths, with * for the time."""
+        return STAMP.sub("*", self.glob)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

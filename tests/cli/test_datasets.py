@@ -274,9 +274,8 @@ def test_points_are_at_the_times_they_were_measured(shell: Shell, name: str) -> 
         assert found[lidar] <= expected, lidar
 
 
-def _report() -> dict[str, Any]:
-    (path,) = [one for one in Path().glob("scans*.json") if "report" in one.name]
-    found: dict[str, Any] = json.loads(path.read_text())
+def _report(output: str = "scans.mcap") -> dict[str, Any]:
+    found: dict[str, Any] = json.loads(Path(f"{output}.report.json").read_text())
     return found
 
 
@@ -350,12 +349,21 @@ def test_a_rig_and_a_batch_of_a_dataset(shell: Shell) -> None:
     assert shell("digest a.mcap").out.split()[0] == shell("digest b.mcap").out.split()[0]
     assert shell("digest c.mcap").out.split()[0] == shell("digest b.mcap").out.split()[0]
     assert shell("batch eee_0*/*.bag --dataset ntu_viral -o out").code == 0
+    (note,) = [one for one in _report("b.mcap")["warnings"] if one["code"] == "dataset"]
+    horizontal = Path("eee_01/lidar_horz.yaml").absolute()
+    assert note["message"].endswith(f"; poses of {horizontal}, {horizontal.parent}/lidar_vert.yaml")
     again = shell("batch eee_0*/*.bag --dataset ntu_viral -o out")
     assert "1 skipped" in again.out
     Path("eee_01/lidar_horz.yaml").write_text(
         Path("eee_01/lidar_horz.yaml").read_text().replace("0.055", "0.056")
     )
     assert "1 done" in shell("batch eee_0*/*.bag --dataset ntu_viral -o out").out
+
+
+def test_a_batch_of_folders_of_sweeps(shell: Shell) -> None:
+    made.helipr()
+    outcome = shell("batch Round*/LiDAR --dataset helipr -o out")
+    assert (outcome.code, "1 done" in outcome.out) == (0, True), outcome.err
 
 
 MISTAKES = {

@@ -16,7 +16,7 @@ import numpy as np
 
 from mlbatch.errors import RecordingError
 from mlbatch.readers.sweeps.files import SweepError, first_ns, read_sweep
-from mlbatch.rig.rig import RigSensor, Sweeps
+from mlbatch.rig.rig import STAMP, RigSensor, Sweeps
 from mlbatch.ros.point_times import ABSOLUTE, CONVENTION, UNITS_NS, PointRule
 from mlbatch.types import CaptureCounts, Message, PacketBatch, Recording, Topic
 from mlbatch.units import NS_PER_MS, NS_PER_S, NS_PER_US
@@ -28,7 +28,6 @@ _UNITS_NS = {10: NS_PER_S, 13: NS_PER_MS, 16: NS_PER_US, 19: 1}
 _SECONDS = re.compile(r"(\d{10})[._](\d{1,9})", re.ASCII)
 _WHOLE = re.compile(r"\d+", re.ASCII)
 _ISO = r"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d(?:\.\d{1,9})?Z"
-_STAMP = re.compile(r"\{stamp(?::(\w+))?\}")
 _LATEST_NS = 2**31 * NS_PER_S
 # A batch ends with the file that exceeds this.
 _BATCH_BYTES = 8 << 20
@@ -124,7 +123,7 @@ def _files(folder: Path, sweeps: Sweeps, rule: PointRule) -> list[_SweepFile]:
     undated: list[Path] = []
     pattern = _name_pattern(sweeps.glob)
     unit_ns = 0
-    for path in sorted(folder.glob(_STAMP.sub("*", sweeps.glob))):
+    for path in sorted(folder.glob(sweeps.paths)):
         if not path.is_file():
             continue
         match = pattern.fullmatch(path.relative_to(folder).as_posix())
@@ -212,7 +211,7 @@ def _name_pattern(glob: str) -> re.Pattern[str]:
 
 def _stamp_ns(text: str, glob: str) -> tuple[int, int]:
     """The time of a name, and the unit of its digits, ns; 0 where it is none."""
-    given = _STAMP.search(glob)
+    given = STAMP.search(glob)
     unit = given[1] if given else None
     if unit == "iso" and re.fullmatch(_ISO, text):
         whole_s = round(datetime.fromisoformat(f"{text[:19]}+00:00").timestamp())
