@@ -231,7 +231,7 @@ def compare(
         sensors=tuple(map(_sensor_sweeps, run.sensors, joiner.lengths_ns)),
         reports=(*joiner.reports(), windows.report(columns)),
         notes=tuple(run.notes),
-        instant=None if finder is None else finder.found,
+        instant=None if finder is None else finder.found(),
     )
 
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -32,7 +33,7 @@ _LONGER_NS = 5_000_000
 
 
 class InstantFinder:
-    """Takes sets of all policies and windows, in order; `found` is the instant so far."""
+    """Takes sets of all policies and windows, in order."""
 
     def __init__(
         self,
@@ -45,7 +46,7 @@ class InstantFinder:
 
         new_decoder: called with the first instant; its scans are dense, with `column`.
         """
-        self.found: SharedInstant | None = None
+        self._best: SharedInstant | None = None
         self._names = names
         self._sensors = sensors
         self._period_ns = period_ns
@@ -57,7 +58,7 @@ class InstantFinder:
         self._count = self._looked = 0
         self._step = _STEP
         self._longest_ns = 0
-        self._score = (False, -1.0)
+        self._score = (False, 0.0, 0)
         lacking = [sensor.name for sensor in sensors if not sensor.detected.pose.is_known]
         self._why = (
             f"No merged clouds: {', '.join(lacking)} without extrinsics; give them in a rig "
@@ -85,7 +86,7 @@ class InstantFinder:
 
     def finish(self) -> None:
         """End of input: look at the last windows of a recording that is too short for others."""
-        if self.found is None:
+        if self._best is None:
             self._step = 1
             for window in list(self._windows)[:-1]:
                 if not window.is_partial:
@@ -95,6 +96,10 @@ class InstantFinder:
         """First ring index of a sensor that an instant may need; None: none."""
         parts = (one.columns.ring_index[one.columns.sensor == sensor] for one in self._windows)
         return min((int(part.min()) for part in parts if len(part)), default=None)
+
+    def found(self) -> SharedInstant | None:
+        """The instant that differs most so far; None without a set."""
+        return self._best and replace(self._best, looked=self._looked)
 
     # -- an instant ---------------------------------------------------------------------------
 
@@ -118,13 +123,10 @@ class InstantFinder:
             other = difference(fused, points[-1], self._period_ns)
             if other is not None and (spot is None or other.score > spot.score):
                 shown, spot = number, other
-        # Without points, by the longest span.
-        score = (False, 0.0) if spot is None else spot.score
-        if self._why and is_longer:
-            score = (False, float(longest_ns))
+        score = *((False, 0.0) if spot is None else spot.score), longest_ns
         if score > self._score:
             self._score = score
-            self.found = self._instant(window, members, points, shown, spot)
+            self._best = self._instant(window, members, points, shown, spot)
 
     def _members(self, window: Window) -> dict[str, SweepSet]:
         """Distinct sets whose last column is nearest to the end of a window, then the window."""
@@ -186,7 +188,7 @@ class InstantFinder:
             ]
         return SharedInstant(
             at_s=(window.end_ns - self._first_ns) / NS_PER_S,
-            looked=self._looked,
+            looked=0,
             sensors=tuple(sensor.name for sensor in self._sensors),
             poses=tuple(sensor.body_from_sensor for sensor in self._sensors),
             period_ns=self._period_ns,

@@ -41,7 +41,7 @@ def comparison_page(
             "kept": kept_words(clouds[0]),
             "instant_rows": [one.row(speed_mps) for one in instant.sets],
             "data": page_json(instant.toggle(clouds)),
-            "script": "".join(map(asset, ("viewer.js", "player.js", "comparison.js"))),
+            "script": "".join(map(asset, ("viewer.js", "player.js", "page.js"))),
         }
     return render(
         "comparison.html",

@@ -173,6 +173,7 @@ class SharedInstant:
             "pair": [self.shown, len(clouds) - 1],
             "colour": "time",
             "spot": spot,
+            "windows": None,
             "clouds": [
                 # The caption begins with the title.
                 cloud_data(replace(one, place=replace(one.place, title="")), 0.0)

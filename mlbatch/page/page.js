@@ -1,4 +1,5 @@
-// Plots and scans of a run; the data are in the element `data`, see document.py.
+// Plots and scans of a run, or clouds of a comparison; the data are in the element `data`, see
+// document.py and instant.py.
 (function () {
   const data = JSON.parse(document.getElementById("data").textContent);
   const byId = (id) => document.getElementById(id);

@@ -74,6 +74,9 @@ def test_ages_of_sets_are_those_of_the_rotors(instant: SharedInstant) -> None:
     assert front == pytest.approx((100, COLUMN_MS), abs=1e-3)
     assert rear == pytest.approx((150, 50 + COLUMN_MS), abs=1e-3)
     assert window.ages_ms == (front, front)
+    # Every fifth of the windows that end 0.4 s before the last one, and the first, whose sets are
+    # longer than none.
+    assert instant.looked == 4
     # All policies give the same sets.
     assert len(instant.sets) == 2
 
