@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from mlbatch.api import calibrate as calibrate
     from mlbatch.api import convert as convert
+    from mlbatch.api import dataset as dataset
     from mlbatch.api import extract as extract
     from mlbatch.api import inspect as inspect
     from mlbatch.api import open as open
@@ -16,6 +17,7 @@ if TYPE_CHECKING:
     from mlbatch.errors import MlbatchError as MlbatchError
     from mlbatch.outputs.scan import Scan as Scan
     from mlbatch.poses.calibration import Calibration as Calibration
+    from mlbatch.python.dataset import Dataset as Dataset
     from mlbatch.python.recording import Recording as Recording
     from mlbatch.python.run import Run as Run
     from mlbatch.verification import verify as verify
@@ -23,12 +25,14 @@ if TYPE_CHECKING:
 __version__ = "0.1.0"
 __all__ = [
     "Calibration",
+    "Dataset",
     "MlbatchError",
     "Recording",
     "Run",
     "Scan",
     "calibrate",
     "convert",
+    "dataset",
     "digest",
     "extract",
     "inspect",
@@ -41,13 +45,15 @@ __all__ = [
 _PLACES = {
     "Calibration": "mlbatch.poses.calibration",
     "MlbatchError": "mlbatch.errors",
+    "Dataset": "mlbatch.python.dataset",
     "Recording": "mlbatch.python.recording",
     "Run": "mlbatch.python.run",
     "Scan": "mlbatch.outputs.scan",
     "digest": "mlbatch.digests",
     "verify": "mlbatch.verification",
     **dict.fromkeys(
-        ("calibrate", "convert", "extract", "inspect", "open", "read", "scans"), "mlbatch.api"
+        ("calibrate", "convert", "dataset", "extract", "inspect", "open", "read", "scans"),
+        "mlbatch.api",
     ),
 }
 

@@ -21,6 +21,7 @@ from mlbatch.pipeline.job import Job
 from mlbatch.poses.calibration import Calibration
 from mlbatch.python.calibrate import calibrate as calibrate_rig
 from mlbatch.python.calibrate import calibrate_job, check_output, rig_text
+from mlbatch.python.dataset import Dataset, dataset_of
 from mlbatch.python.extract import ExtractOptions, extraction
 from mlbatch.python.options import (
     AnyPath,
@@ -111,6 +112,15 @@ def read(output: AnyPath) -> Iterator[Scan]:
     """
     (path,) = paths_of("output", output)
     return read_output(path)
+
+
+def dataset(*outputs: Paths) -> Dataset:
+    """Open finished outputs of `convert` for random access, as for training.
+
+    outputs: paths, or patterns ("out/*"), which leave out what is no finished output. Only indexes
+    are read. Raises MlbatchError where an output is damaged.
+    """
+    return dataset_of(path for one in outputs for path in paths_of("output", one))
 
 
 def inspect(recordings: Paths, metadata: Paths = (), *, whole: bool = False) -> Inspection:

@@ -11,6 +11,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from io import SEEK_END, BufferedReader, BytesIO
 from pathlib import Path
+from typing import NamedTuple
 
 from mlbatch.bounded import open_file
 from mlbatch.outputs.damage import DamageError
@@ -43,6 +44,21 @@ class Message:
     log_ns: int
     publish_ns: int
     data: bytes | memoryview
+
+
+class MessagePlace(NamedTuple):
+    """Where a message is in its file.
+
+    number: of its topic's messages; chunk, chunk_bytes: offset in the file and size of the chunk's
+    record or data; offset: of the message's record in the chunk.
+    """
+
+    topic: str
+    number: int
+    log_ns: int
+    chunk: int
+    chunk_bytes: int
+    offset: int
 
 
 @contextmanager

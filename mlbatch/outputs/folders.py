@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import re
-import zlib
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
+
+from isal.isal_zlib import crc32
 
 from mlbatch.bounded import MOST_TABLE_BYTES, read_bytes
 from mlbatch.outputs.damage import CheckLog, DamageError, VerifyError
@@ -44,7 +45,7 @@ class ScanFile:
         except OSError as err:
             which = f" {other.name} next to it" if other else ""
             raise DamageError(f"a readable file{which}", str(err.strerror)) from err
-        self.checksum = (self.checksum + zlib.crc32(data)) % (1 << 32)
+        self.checksum = (self.checksum + crc32(data, 0)) % (1 << 32)
         return data
 
     def check_name(self, log: CheckLog, index: int, part: int, slices: int) -> None:

@@ -7,19 +7,20 @@ from __future__ import annotations
 
 import importlib
 import struct
-import zlib
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
 import zstandard
+from isal.isal_zlib import crc32
 from mcap.records import (
     Attachment,
     Channel,
     Chunk,
     Header,
     McapRecord,
+    MessageIndex,
     Metadata,
     Schema,
 )
@@ -29,6 +30,7 @@ from mcap.stream_reader import StreamReader
 from mlbatch.outputs.containers import (
     BoundedFile,
     Message,
+    MessagePlace,
     WholeReads,
     check_unpacked_size,
     library_errors,
@@ -37,6 +39,8 @@ from mlbatch.outputs.damage import CheckLog, DamageError, VerifyError
 
 MCAP_MAGIC = b"\x89MCAP0\r\n"
 _HEAD = struct.Struct("<BQ")
+# Opcode, length of what follows, channel, sequence, log time, publish time.
+_MESSAGE_HEAD = struct.Struct("<BQHIQQ")
 _FOOTER_BYTES = _HEAD.size + 20
 # Of a chunk: all but compression and records.
 _CHUNK_BYTES = 40
@@ -144,7 +148,7 @@ class McapFile:
         elif isinstance(record, Attachment):
             self.attachments[record.name] = record.data
             # The library skips this checksum.
-            actual = zlib.crc32(memoryview(data)[_HEAD.size : -4])
+            actual = crc32(memoryview(data)[_HEAD.size : -4], 0)
             stored = int.from_bytes(data[-4:], "little")
             self._log.equal("container", f"{self._where} {record.name} CRC", actual, stored)
         self._listener.record(place, record)
@@ -176,8 +180,68 @@ class McapFile:
             file.seek(summary_at)
             listener.summary(file.read(), summary_at)
 
-    def _chunk_messages(self, place: Place, record: Chunk) -> Iterator[Message]:
-        log = self._log
+    def places(self, topics: Collection[str]) -> list[MessagePlace]:
+        """Where the messages of topics are, in the order of the file, by its indexes."""
+        entries: list[tuple[Place, int, int, int]] = []
+        chunk = Place(0, 0, 0)
+        with BoundedFile(self._path) as file:
+            end = 0
+            for place in self._places(file):
+                end = place.at + place.size
+                chunk = place if place.opcode == _CHUNK else chunk
+                if place.opcode == _MESSAGE_INDEX:
+                    _, record = next(records_of(_bytes_of(file, place)))
+                    if isinstance(record, MessageIndex):
+                        own = ((chunk, offset, log_ns) for log_ns, offset in record.records)
+                        entries += [(*entry, record.channel_id) for entry in own]
+            file.seek(end)
+            for _, record in records_of(file.read(file.size - end - len(MCAP_MAGIC))):
+                self._learn(record)
+        found: list[MessagePlace] = []
+        counts: Counter[str] = Counter()
+        # Indexes are by channel; entries of a chunk are in the order of its bytes.
+        for chunk, offset, log_ns, number in sorted(entries, key=lambda one: (one[0].at, one[1])):
+            topic = self._channels.get(number, ("", "", ""))[0]
+            if topic in topics:
+                at = MessagePlace(topic, counts[topic], log_ns, chunk.at, chunk.size, offset)
+                found.append(at)
+                counts[topic] += 1
+        return found
+
+    def message_at(self, log: CheckLog, place: MessagePlace) -> Message | None:
+        """One message, None if its chunk is damaged; DamageError if there is none."""
+        with BoundedFile(self._path) as file:
+            chunk = Place(_CHUNK, place.chunk, place.chunk_bytes)
+            raw = _bytes_of(file, chunk)
+        _, record = next(records_of(raw))
+        if not isinstance(record, Chunk):
+            raise DamageError(f"a chunk at byte {place.chunk}", type(record).__name__)
+        data = self._chunk_data(log, chunk, record)
+        if data is None:
+            return None
+        begin = place.offset + _MESSAGE_HEAD.size
+        head = data[place.offset : begin]
+        if len(head) < _MESSAGE_HEAD.size:
+            raise DamageError(f"a message at offset {place.offset}", f"{len(data)} bytes")
+        opcode, length, channel, _, log_ns, publish_ns = _MESSAGE_HEAD.unpack(head)
+        topic, kind, encoding = self._channels.get(channel, ("", "", ""))
+        end = place.offset + _HEAD.size + length
+        if (opcode, topic, log_ns) != (_MESSAGE, place.topic, place.log_ns) or end > len(data):
+            raise DamageError(f"a message at offset {place.offset}, as by the index", "another")
+        where = f"{self._where} {topic} message {place.number}"
+        content = memoryview(data)[begin:end]
+        return Message(where, topic, kind, encoding, log_ns, publish_ns, content)
+
+    def _learn(self, record: McapRecord) -> None:
+        """Keep a schema or channel."""
+        if isinstance(record, Channel):
+            kind = self._schemas.get(record.schema_id, "")
+            self._channels[record.id] = (record.topic, kind, record.message_encoding)
+        elif isinstance(record, Schema):
+            self._schemas[record.id] = record.name.replace("/msg/", "/")
+
+    def _chunk_data(self, log: CheckLog, place: Place, record: Chunk) -> bytes | None:
+        """The records of a chunk; None if its checksum is wrong."""
         where = f"{self._where} chunk at byte {place.at}"
         stored = _HEAD.size + _CHUNK_BYTES + len(record.compression.encode()) + len(record.data)
         if stored != place.size:
@@ -185,7 +249,13 @@ class McapFile:
         data = unpacked(record.compression, record.data, record.uncompressed_size)
         log.equal("container", f"{where} size", len(data), record.uncompressed_size)
         crc = f"{record.uncompressed_crc:08x}"
-        if not log.equal("container", f"{where} CRC", f"{zlib.crc32(data):08x}", crc):
+        is_right = log.equal("container", f"{where} CRC", f"{crc32(data, 0):08x}", crc)
+        return data if is_right else None
+
+    def _chunk_messages(self, place: Place, record: Chunk) -> Iterator[Message]:
+        where = f"{self._where} chunk at byte {place.at}"
+        data = self._chunk_data(self._log, place, record)
+        if data is None:
             return
         self._listener.chunk(place, len(data))
         for offset, inner in records_of(data):
@@ -194,14 +264,10 @@ class McapFile:
                 self._listener.inner(offset, inner, message.where)
                 yield message
                 continue
-            if isinstance(inner, Channel):
-                kind = self._schemas.get(inner.schema_id, "")
-                self._channels[inner.id] = (inner.topic, kind, inner.message_encoding)
-            elif isinstance(inner, Schema):
-                self._schemas[inner.id] = inner.name.replace("/msg/", "/")
-            else:
+            if not isinstance(inner, Channel | Schema):
                 found = f"{type(inner).__name__} at {offset}"
                 raise DamageError("a schema, channel or message", found)
+            self._learn(inner)
             self._listener.inner(offset, inner, "")
         self._listener.chunk_end(where, record)
 

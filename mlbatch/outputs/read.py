@@ -1,14 +1,14 @@
-"""`mlbatch.read`: the scans of an output, one after another, whatever its format.
+"""The scans of an output, whatever its format: one after another, or each alone (`open_scans`).
 
 Anything that the readers of a format report as damaged is an error here.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -16,22 +16,23 @@ import numpy.typing as npt
 from mlbatch.batching.grid import Grid
 from mlbatch.errors import RecordingError, UsageError
 from mlbatch.outputs.cloud_messages import CLOUD, read_cloud, stored_scan
-from mlbatch.outputs.containers import Message
+from mlbatch.outputs.containers import Message, MessagePlace
 from mlbatch.outputs.damage import CheckLog, DamageError
 from mlbatch.outputs.encoding import MessageCursor
-from mlbatch.outputs.folders import ScanFile, scan_files
+from mlbatch.outputs.folders import ScanFile, ScanReader, scan_files
 from mlbatch.outputs.kinds import FileFormat, format_of, kind_of
 from mlbatch.outputs.metadata import RunMetadata, metadata_of_grid
 from mlbatch.outputs.run_files import PIECES, RunFiles, inner_texts, mcaps_of
 from mlbatch.outputs.scan import Scan
 from mlbatch.outputs.stored_scan import StoredScan
-from mlbatch.outputs.table import ScanRow, TableOfRun, read_table
+from mlbatch.outputs.table import UNKNOWN, ScanRow, TableOfRun, read_table
 from mlbatch.report.report import RunReport, report_of
 from mlbatch.types import RunInfo, SensorInfo
 from mlbatch.units import NS_PER_S, parse_rate
 
 if TYPE_CHECKING:
     from mlbatch.outputs.mcap_file import McapFile
+    from mlbatch.outputs.rosbag1 import BagFile
 
 Array: TypeAlias = npt.NDArray[Any]
 _PARTIAL = ".partial"
@@ -55,22 +56,14 @@ def read(path: Path, *, by_window: bool = False) -> Iterator[Scan]:
     by_window: by time also where sensors have folders. Raises RecordingError where the output is
     damaged, unfinished or of another program.
     """
-    if path.name.endswith(_PARTIAL):
-        raise RecordingError(
-            f"{path}: expected a finished output, found that of an unfinished run; convert again, "
-            "or continue it with --resume"
-        )
+    _refuse_partial(path)
     kind = kind_of(path)
     log = CheckLog()
-    if kind.name == "mcap":
-        yield from _scans_of_mcaps(log, path, {path.name: path})
-    elif kind.name == "rosbag1":
-        yield from _scans_of_bag(log, path)
-    elif kind.name == "rosbag2":
-        from mlbatch.outputs.rosbag2 import open_bag
-
-        bag, _ = open_bag(log, path)
-        yield from _scans_of_mcaps(log, path, {f"{path.name}/{file.name}": file for file in bag})
+    if kind.name in ("mcap", "rosbag1", "rosbag2"):
+        scans: MessageScans | None = None
+        for file, source in _message_files(log, path, kind.name):
+            scans = scans or MessageScans(path, _run_of_file(log, path, file, source))
+            yield from _scans_of_messages(log, file, scans, source.messages())
     elif kind.form is not None:
         files = scan_files(log, path, kind.form.suffix)
         if by_window:
@@ -78,6 +71,14 @@ def read(path: Path, *, by_window: bool = False) -> Iterator[Scan]:
         yield from _scans_of_files(path, kind.form, files, log)
     else:
         yield from _scans_of_file(path, kind.found)
+
+
+def _refuse_partial(path: Path) -> None:
+    if path.name.endswith(_PARTIAL):
+        raise RecordingError(
+            f"{path}: expected a finished output, found that of an unfinished run; convert again, "
+            "or continue it with --resume"
+        )
 
 
 def _refuse_damage(log: CheckLog, path: Path) -> None:
@@ -92,17 +93,35 @@ def _refuse_damage(log: CheckLog, path: Path) -> None:
 # -- messages -------------------------------------------------------------------------------------
 
 
-def _scans_of_mcaps(log: CheckLog, output: Path, paths: Mapping[str, Path]) -> Iterator[Scan]:
-    """The scans of an output of MCAP files; paths: of all, by their names for errors."""
+def _message_files(
+    log: CheckLog, output: Path, kind: str
+) -> Iterator[tuple[Path, McapFile | BagFile]]:
+    """Open the files of an output with messages, one after another."""
+    if kind == "rosbag1":
+        from mlbatch.outputs.rosbag1 import BagFile
+
+        yield output, BagFile(log, output, output.name)
+        return
     from mlbatch.outputs.mcap_file import McapFile
 
+    names = {output: output.name}
+    if kind == "rosbag2":
+        from mlbatch.outputs.rosbag2 import open_bag
+
+        bag, _ = open_bag(log, output)
+        names = {file: f"{output.name}/{file.name}" for file in bag}
     _refuse_damage(log, output)
-    run: _Run | None = None
-    for where, path in paths.items():
-        file = McapFile(log, path, where)
-        if run is None:
-            run = _run_of_mcap(log, output, path, file)
-        yield from _scans_of_messages(log, path, run, file.messages())
+    for path, where in names.items():
+        yield path, McapFile(log, path, where)
+
+
+def _run_of_file(log: CheckLog, output: Path, path: Path, file: McapFile | BagFile) -> _Run:
+    """The constants of a run by its first file."""
+    from mlbatch.outputs.rosbag1 import BagFile
+
+    if isinstance(file, BagFile):
+        return _run_of_bag(path)
+    return _run_of_mcap(log, output, path, file)
 
 
 def _run_of_mcap(log: CheckLog, output: Path, path: Path, file: McapFile) -> _Run:
@@ -131,17 +150,9 @@ def _run_of_bag(path: Path) -> _Run:
     return _Run(str(path), RunMetadata(), files.report_text(), files.table_text())
 
 
-def _scans_of_bag(log: CheckLog, path: Path) -> Iterator[Scan]:
-    from mlbatch.outputs.rosbag1 import BagFile
-
-    messages = BagFile(log, path, path.name).messages()
-    yield from _scans_of_messages(log, path, _run_of_bag(path), messages)
-
-
 def _scans_of_messages(
-    log: CheckLog, path: Path, run: _Run, messages: Iterable[Message]
+    log: CheckLog, path: Path, scans: MessageScans, messages: Iterable[Message]
 ) -> Iterator[Scan]:
-    scans = MessageScans(path, run)
     for message in messages:
         _refuse_damage(log, path)
         scan = scans.scan(message)
@@ -156,6 +167,7 @@ class MessageScans:
     def __init__(self, path: Path, run: _Run) -> None:
         self._path = path
         self._run = run
+        self._read = 0
         # Topics of scans, with the only sensor of each.
         self.topics: dict[str, int | None] = {"/points": None}
         self.topics |= {f"/{name}/points": i for i, name in enumerate(run.sensors)}
@@ -172,13 +184,16 @@ class MessageScans:
         file = McapFile(log, mcaps[0], mcaps[0].name)
         return cls(path, _run_of_mcap(log, path, mcaps[0], file))
 
-    def scan(self, message: Message) -> Scan | None:
-        """The scan in a message; None for other messages."""
+    def scan(self, message: Message, number: int | None = None) -> Scan | None:
+        """The scan in a message, None for other messages; number: of the scan, None: the next."""
         if message.type != CLOUD or message.topic not in self.topics:
             return None
+        if number is None:
+            number = self._read
+            self._read += 1
         try:
             cloud = read_cloud(MessageCursor.of_message(message.data, message.encoding))
-            index, part, start_ns, end_ns = self._run.window_of_message(cloud.stamp_ns)
+            index, part, start_ns, end_ns = self._run.window_of_message(cloud.stamp_ns, number)
             cloud = replace(cloud, stamp_ns=start_ns)
             stored = stored_scan(cloud, message.where, self.topics[message.topic])
         except DamageError as err:
@@ -202,7 +217,11 @@ def _scans_of_file(path: Path, found: str) -> Iterator[Scan]:
         if files:
             yield from _scans_of_files(folder, form, files, CheckLog())
             return
-    raise RecordingError(
+    raise _no_output(path, found)
+
+
+def _no_output(path: Path, found: str) -> RecordingError:
+    return RecordingError(
         f"{path}: expected an output of `mlbatch convert` (a .mcap or .bag file, or a folder), "
         f"found {found}; name one"
     )
@@ -211,6 +230,17 @@ def _scans_of_file(path: Path, found: str) -> Iterator[Scan]:
 def _scans_of_files(
     folder: Path, form: FileFormat, files: list[ScanFile], log: CheckLog
 ) -> Iterator[Scan]:
+    run, reader, frame_id = _run_of_files(folder, form, files, log)
+    for stored in reader.scans(files):
+        _refuse_damage(log, folder)
+        yield run.scan(stored, frame_id)
+    _refuse_damage(log, folder)
+
+
+def _run_of_files(
+    folder: Path, form: FileFormat, files: list[ScanFile], log: CheckLog
+) -> tuple[_Run, ScanReader, str]:
+    """The constants of a run, the reader of its files, and the frame of its points."""
     _refuse_damage(log, folder)
     reader = form.reader(log)
     try:
@@ -223,10 +253,128 @@ def _scans_of_files(
     texts = RunFiles.of(folder)
     run = _Run(str(folder), metadata, texts.report_text(), texts.table_text())
     reader.know(run.metadata)
-    for stored in reader.scans(files):
-        _refuse_damage(log, folder)
-        yield run.scan(stored, metadata.frame_id or "")
-    _refuse_damage(log, folder)
+    return run, reader, metadata.frame_id or ""
+
+
+# -- scans by number ------------------------------------------------------------------------------
+
+
+class ScanPlace(NamedTuple):
+    """A scan of an output; sensor: with `--split`; points: -1 if no table has their number."""
+
+    sensor: str
+    window: int
+    slice: int
+    start_ns: int
+    points: int
+    path: str
+
+
+class IndexedScans:
+    """The scans of an output by number, in the order of `read`; files are closed between."""
+
+    def __init__(self, path: Path, run: _Run) -> None:
+        self.path = path
+        self._run = run
+        self.places: list[ScanPlace] = []
+
+    def scan(self, number: int) -> Scan:
+        """Read one scan; RecordingError where it is damaged."""
+        raise NotImplementedError
+
+    def _add(self, path: Path, index: int, part: int, sensor: int | None) -> None:
+        start_ns, points = self._run.start_and_points(index, part, sensor)
+        name = "" if sensor is None else self._run.sensors[sensor]
+        self.places.append(ScanPlace(name, index, part, start_ns, points, str(path)))
+
+
+class _IndexedMessages(IndexedScans):
+    """An MCAP file, or a bag."""
+
+    def __init__(self, path: Path, kind: str) -> None:
+        from mlbatch.outputs.mcap_file import McapFile
+
+        log = CheckLog()
+        self._files: list[McapFile | BagFile] = []
+        # Number of the file.
+        self._messages: list[tuple[int, MessagePlace]] = []
+        for file, source in _message_files(log, path, kind):
+            if not self._files:
+                super().__init__(path, _run_of_file(log, path, file, source))
+                self._scans = MessageScans(path, self._run)
+            if isinstance(source, McapFile):
+                # They have all rows of scans.csv.
+                source.attachments.clear()
+            topics = self._scans.topics
+            try:
+                found = source.places(topics)
+            except DamageError as err:
+                raise RecordingError(f"{file}: {err}; see `mlbatch verify`") from err
+            _refuse_damage(log, path)
+            for place in found:
+                number = len(self._messages)
+                index, part, _, _ = self._run.window_of_message(place.log_ns, number)
+                self._add(file, index, part, topics[place.topic])
+                self._messages.append((len(self._files), place))
+            self._files.append(source)
+        expected = self._run.rows
+        windows = len({(place.window, place.slice) for place in self.places})
+        if expected is not None and windows != expected:
+            raise RecordingError(
+                f"{path}: expected the {expected} windows of scans.csv in the index, found "
+                f"{windows}; see `mlbatch verify`, and convert again"
+            )
+
+    def scan(self, number: int) -> Scan:
+        log = CheckLog()
+        file, place = self._messages[number]
+        try:
+            message = self._files[file].message_at(log, place)
+        except (DamageError, OSError) as err:
+            raise RecordingError(f"{self.path}: {err}; see `mlbatch verify`") from err
+        _refuse_damage(log, self.path)
+        scan = None if message is None else self._scans.scan(message, number)
+        if scan is None:
+            raise RecordingError(
+                f"{self.path}: {place.topic}: expected {CLOUD}, found another message; see "
+                "`mlbatch verify`"
+            )
+        return scan
+
+
+class _IndexedFiles(IndexedScans):
+    """A folder with a file for each scan."""
+
+    def __init__(self, path: Path, form: FileFormat) -> None:
+        log = CheckLog()
+        self._files = scan_files(log, path, form.suffix)
+        run, self._reader, self._frame_id = _run_of_files(path, form, self._files, log)
+        super().__init__(path, run)
+        for file in self._files:
+            sensor = file.sensor_index(log, run.sensors)
+            self._add(file.path, file.index, file.slice or 0, sensor)
+        _refuse_damage(log, path)
+
+    def scan(self, number: int) -> Scan:
+        # Damage of one scan is none of the next.
+        log = self._reader.log = CheckLog()
+        stored = list(self._reader.scans([self._files[number]]))
+        _refuse_damage(log, self.path)
+        return self._run.scan(stored[0], self._frame_id)
+
+
+def open_scans(path: Path) -> IndexedScans:
+    """The scans of an output of `convert`, each of which can be read alone.
+
+    Only the indexes of the output are read. RecordingError for what is none, or unfinished.
+    """
+    _refuse_partial(path)
+    kind = kind_of(path)
+    if kind.form is not None:
+        return _IndexedFiles(path, kind.form)
+    if not kind.name:
+        raise _no_output(path, "one file of a folder" if format_of([path]) else kind.found)
+    return _IndexedMessages(path, kind.name)
 
 
 # -- scans ----------------------------------------------------------------------------------------
@@ -270,13 +418,9 @@ class _Run:
             raise RecordingError(f"{where}: {err}; convert again") from err
         # Number of the first slice.
         self._first = self._grid.index_of(metadata.t_init_ns or 0)
-        # Messages so far.
-        self._read = 0
 
-    def window_of_message(self, stamp_ns: int) -> tuple[int, int, int, int]:
-        """Index, slice, start and end (ns) of the next message."""
-        number = self._read
-        self._read += 1
+    def window_of_message(self, stamp_ns: int, number: int) -> tuple[int, int, int, int]:
+        """Index, slice, start and end (ns) of a message, by its stamp and its number."""
         if self.metadata.batching is None:
             # The end of a window is the start of the next one.
             start_ns = self._grid.floor_bound(stamp_ns - (self.metadata.stamp == "end"))
@@ -292,6 +436,21 @@ class _Run:
         number = self._grid.index_of(start_ns)
         index, part = divmod(number - self._first, self._grid.slices)
         return index, part, self._grid.bound(number + 1)
+
+    @property
+    def rows(self) -> int | None:
+        """Number of windows by the table; None without one."""
+        return None if self._table is None else len(self._table.rows)
+
+    def start_and_points(self, index: int, part: int, sensor: int | None) -> tuple[int, int]:
+        """Start (ns) of a scan, and its number of points by the table; UNKNOWN: not in it."""
+        row = None if self._table is None else self._table.number(index, part)
+        if self._table is None or row is None:
+            number = self._first + index * self._grid.slices + part
+            return self._grid.bound(number), UNKNOWN
+        found = self._table.rows[row]
+        # With `--split` that of all sensors.
+        return int(found["start_ns"]), int(found["points"]) if sensor is None else UNKNOWN
 
     def scan(self, stored: StoredScan, frame_id: str) -> Scan:
         """A scan as users get it."""
@@ -358,10 +517,13 @@ def point_arrays(stored: StoredScan) -> dict[str, Array]:
     if stored.time_s is not None:
         # The product of a float32 and 10^9 has fewer bits than a float64: the smallest ns that
         # gives it, since float32 are rounded toward zero.
-        time_ns = stored.time_s.astype(np.float64) * NS_PER_S
-        found["time_ns"] = np.ceil(time_ns) if stored.time_s.itemsize == 4 else np.rint(time_ns)
+        time_ns = stored.time_s.astype(np.float64)
+        time_ns *= NS_PER_S
+        rounded = np.ceil if stored.time_s.itemsize == 4 else np.rint
+        found["time_ns"] = rounded(time_ns, out=time_ns)
     if found["time_ns"] is not None:
-        found["time_ns"] = np.maximum(found["time_ns"], 0)
+        # Of this scan alone.
+        np.maximum(found["time_ns"], 0, out=found["time_ns"])
     if stored.sensor is not None and found["lidar_id"] is None:
         # All points are of this sensor, whether the layout has a field for it or not.
         found["lidar_id"] = np.full(stored.xyz.shape[:-1], stored.sensor, np.uint8)

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import struct
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 from io import SEEK_CUR
 from pathlib import Path
@@ -16,7 +16,13 @@ from typing import TypeAlias
 from rosbags.rosbag1 import Reader
 from rosbags.rosbag1.reader import Header, RecordType, read_uint32
 
-from mlbatch.outputs.containers import BoundedFile, Message, WholeReads, library_errors
+from mlbatch.outputs.containers import (
+    BoundedFile,
+    Message,
+    MessagePlace,
+    WholeReads,
+    library_errors,
+)
 from mlbatch.outputs.damage import CheckLog, DamageError, VerifyError
 
 BAG_MAGIC = b"#ROSBAG V2.0\n"
@@ -42,6 +48,7 @@ class BagFile:
         self._path = path
         self._where = where
         self._counts: Counter[str] = Counter()
+        self._types: dict[str, str] = {}
 
     def messages(self) -> Iterator[Message]:
         """All messages in the order of the file; each chunk is checked against the index."""
@@ -57,6 +64,45 @@ class BagFile:
                     reader.close()
         except DamageError as err:
             raise VerifyError(f"{self._path}: {err}; convert again") from err
+
+    def places(self, topics: Collection[str]) -> list[MessagePlace]:
+        """Where the messages of topics are, in the order of the file, by its index."""
+        with BoundedFile(self._path) as file:
+            chunks = self._chunks(file)
+        reader = Reader(self._path)
+        with library_errors("the index of a bag"):
+            reader.open()
+        self._types = {one.topic: one.msgtype.replace("/msg/", "/") for one in reader.connections}
+        entries = [
+            (chunk, offset, time_ns, one.topic)
+            for one in reader.connections
+            if one.topic in topics
+            for time_ns, chunk, offset in reader.indexes.get(one.id, ())
+        ]
+        # Forgets all.
+        reader.close()
+        found: list[MessagePlace] = []
+        counts: Counter[str] = Counter()
+        for at, offset, time_ns, topic in sorted(entries):
+            chunk = chunks[at]
+            place = MessagePlace(topic, counts[topic], time_ns, chunk.at, chunk.size, offset)
+            found.append(place)
+            counts[topic] += 1
+        return found
+
+    def message_at(self, log: CheckLog, place: MessagePlace) -> Message:
+        """One message; DamageError if there is none."""
+        where = f"{self._where} {place.topic} message {place.number}"
+        with BoundedFile(self._path) as file, library_errors(f"{where} at its place"):
+            file.seek(place.chunk + place.offset)
+            header = Header.read(file)
+            kind, log_ns = header.get_uint8("op"), header.get_time("time")
+            data = file.read(read_uint32(file))
+            is_inside = file.tell() <= place.chunk + place.chunk_bytes
+        if (kind, log_ns, is_inside) != (RecordType.MSGDATA, place.log_ns, True):
+            raise DamageError(f"{where}, as by the index", "another record")
+        kind_of_message = self._types[place.topic]
+        return Message(where, place.topic, kind_of_message, "ros1", log_ns, log_ns, data)
 
     def _chunks(self, file: BoundedFile) -> dict[int, _Chunk]:
         """All chunks by position; the records of the bag and its index are checked against them."""

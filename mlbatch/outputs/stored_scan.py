@@ -21,12 +21,16 @@ _MOST_S = 4.0
 def seconds_to_ns(time_s: F32Array | F64Array) -> tuple[I64Array, int]:
     """Times as stored, s, in ns, and their largest error; float32 are rounded toward zero."""
     # Before the conversion, which warns of signalling NaN.
-    exact: F64Array = np.clip(np.nan_to_num(time_s).astype(np.float64), -_MOST_S, _MOST_S)
+    exact: F64Array = np.nan_to_num(time_s).astype(np.float64)
+    # In place: new memory takes longer than the sums.
+    np.clip(exact, -_MOST_S, _MOST_S, out=exact)
+    longest_s = max(float(exact.max(initial=0)), -float(exact.min(initial=0)))
+    exact *= _NS
     if time_s.dtype.itemsize > np.dtype("f4").itemsize:
-        return np.rint(exact * _NS).astype(np.int64), 0
+        return np.rint(exact, out=exact).astype(np.int64), 0
     # Never later than the true time.
-    step_s = float(np.spacing(np.float32(np.abs(exact).max(initial=0))))
-    return np.floor(exact * _NS).astype(np.int64), int(step_s * _NS) + 1
+    step_s = float(np.spacing(np.float32(longest_s)))
+    return np.floor(exact, out=exact).astype(np.int64), int(step_s * _NS) + 1
 
 
 @dataclass(slots=True)

@@ -163,9 +163,13 @@ class TableOfRun:
         keys = zip(self.rows["index"].tolist(), self.rows["slice"].tolist(), strict=True)
         self._numbers.update((key, number) for number, key in enumerate(keys))
 
+    def number(self, index: int, part: int) -> int | None:
+        """Number of the row of a window or slice."""
+        return self._numbers.get((index, part))
+
     def row(self, index: int, part: int, only: int | None = None) -> ScanRow | None:
         """The row of a window or slice; only: the sensor of the scan with `--split`."""
-        number = self._numbers.get((index, part))
+        number = self.number(index, part)
         if number is None:
             return None
         row = self.rows[number]

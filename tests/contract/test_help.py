@@ -259,7 +259,7 @@ def test_the_root_offers_its_names_without_loading_them() -> None:
         "print(sorted(name for name in mlbatch.__all__ if getattr(mlbatch, name) is not None))"
     )
     names = [
-        *("Calibration", "MlbatchError", "Recording", "Run", "Scan", "calibrate", "convert"),
-        *("digest", "extract", "inspect", "open"),
+        *("Calibration", "Dataset", "MlbatchError", "Recording", "Run", "Scan", "calibrate"),
+        *("convert", "dataset", "digest", "extract", "inspect", "open"),
     ]
     assert printed.strip() == str([*names, "read", "scans", "verify"])
