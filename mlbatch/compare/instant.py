@@ -129,11 +129,12 @@ class InstantFinder:
             self._best = self._instant(window, members, points, shown, spot)
 
     def _members(self, window: Window) -> dict[str, SweepSet]:
-        """Distinct sets whose last column is nearest to the end of a window, then the window."""
+        """Distinct sets that end nearest to a window, at most half a period off; then the window."""
         names: dict[SweepSet, list[str]] = {}
         for name, sets in zip(self._names, self._sets, strict=False):
             nearest = min(sets, key=lambda one: abs(_last_ns(one) - window.end_ns), default=None)
-            if nearest is None or abs(_last_ns(nearest) - window.end_ns) > self._period_ns:
+            # Else of another window: the first sets, or after a silence.
+            if nearest is None or 2 * abs(_last_ns(nearest) - window.end_ns) > self._period_ns:
                 continue
             newest_ns = max(one.first_ns for one in nearest if one is not None)
             kept = tuple(
