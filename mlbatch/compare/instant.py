@@ -129,7 +129,7 @@ class InstantFinder:
             self._best = self._instant(window, members, points, shown, spot)
 
     def _members(self, window: Window) -> dict[str, SweepSet]:
-        """Distinct sets that end nearest to a window, at most half a period off; then the window."""
+        """Distinct sets that end nearest to a window, up to half a period off; then the window."""
         names: dict[SweepSet, list[str]] = {}
         for name, sets in zip(self._names, self._sets, strict=False):
             nearest = min(sets, key=lambda one: abs(_last_ns(one) - window.end_ns), default=None)
