@@ -176,24 +176,23 @@ def _found(node: Node, folders: Sequence[Path], dataset: Dataset) -> Path:
 
 def by_topics(topics: Collection[str]) -> list[str]:
     """Datasets all of whose topics are there, those with the most of them first."""
-    # One topic alone is that of many recordings.
     texts = [f"topic: {topic}}}" for topic in topics]
-    return _with_most("stream", "topic", 2, lambda topic: topic in topics, texts)
+    # One topic alone is that of many recordings.
+    return _with_most(("stream", "topic"), 2, texts, lambda topic: topic in topics)
 
 
 def by_files(folder: Path) -> list[str]:
     """Datasets whose files of sweeps are in a folder, those with the most lidars first."""
-    return _with_most("points", "glob", 1, lambda glob: any(folder.glob(STAMP.sub("*", glob))))
+    return _with_most(
+        ("points", "glob"), 1, [""], lambda glob: any(folder.glob(STAMP.sub("*", glob)))
+    )
 
 
 def _with_most(
-    section: str,
-    key: str,
-    least: int,
-    is_there: Callable[[str], bool],
-    texts: Sequence[str] = ("",),
+    keys: tuple[str, str], least: int, texts: Sequence[str], is_there: Callable[[str], bool]
 ) -> list[str]:
     """Recipes of which a key of the sensors, and all signs, are there; texts: some must be."""
+    section, key = keys
     found = []
     for name in recipe_names():
         text = recipe_path(name).read_text(encoding="utf-8")

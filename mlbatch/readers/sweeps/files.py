@@ -65,19 +65,16 @@ def read_sweep(path: Path, sweeps: Sweeps, stamp_ns: int) -> bytes:
 
 
 def first_ns(path: Path, sweeps: Sweeps, rule: PointRule) -> int:
-    """The earliest time of the points of a file, which count from 1970 in the unit of the rule."""
-    times = tuple(pair for pair in sweeps.arrays if pair[0] == rule.time)
-    columns = _columns(path, sweeps._replace(arrays=times or sweeps.arrays))
-    name = rule.time or next((name for name in TIME_NAMES if name in columns), "")
-    if name not in columns or not rule.unit_ns:
-        raise SweepError(
-            f"{path}: expected the time of the sweep as its name, or points with times from 1970 "
-            f"as `time` and `unit`, found fields {', '.join(columns)} and unit "
-            f"{rule.keys()['unit'] or 'none'}; give both in the rig"
-        )
-    if not len(columns[name]):
-        raise SweepError(f"{path}: expected points, found none; remove it")
-    first: float = columns[name].min().item()
+    """The earliest time of points, which count from 1970 in the unit of the rule; 0: not known."""
+    needed = tuple(pair for pair in sweeps.arrays if pair[0] == rule.time)
+    try:
+        columns = _columns(path, sweeps._replace(arrays=needed or sweeps.arrays))
+    except SweepError:
+        return 0
+    times = [columns[name] for name in (rule.time, *TIME_NAMES) if name in columns]
+    if not times or not len(times[0]):
+        return 0
+    first: float = times[0].min().item()
     # In two parts: a float64 of ns since 1970 has a step of 256.
     return int(first // 1) * rule.unit_ns + round(first % 1 * rule.unit_ns)
 

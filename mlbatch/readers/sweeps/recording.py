@@ -128,8 +128,9 @@ def _files(folder: Path, sweeps: Sweeps, rule: PointRule) -> list[_SweepFile]:
             continue
         match = pattern.fullmatch(path.relative_to(folder).as_posix())
         stamp_ns, own_unit_ns = _stamp_ns(match["stamp"] if match else "", sweeps.glob)
-        if not stamp_ns and rule.origin == ABSOLUTE and "{stamp" not in sweeps.glob:
-            stamp_ns, own_unit_ns = _first_ns(path, sweeps, rule), 1
+        is_of_points = rule.origin == ABSOLUTE and rule.unit_ns and "{stamp" not in sweeps.glob
+        if not stamp_ns and is_of_points:
+            stamp_ns, own_unit_ns = first_ns(path, sweeps, rule), 1
             if not stamp_ns:
                 undated.append(path)
                 continue
@@ -138,7 +139,8 @@ def _files(folder: Path, sweeps: Sweeps, rule: PointRule) -> list[_SweepFile]:
                 f"{path}: expected the time of the sweep as its name (10 digits of s since 1970, "
                 "13 of ms, 16 of us, 19 of ns, or s with decimals), found "
                 f"{(match['stamp'] if match else path.name)!r}; rename the files by the dataset's "
-                f"list of times, or correct the pattern {sweeps.glob} ({sweeps.place})"
+                f"list of times, correct the pattern {sweeps.glob} ({sweeps.place}), or "
+                "give `unit` of points with from: absolute"
             )
         if unit_ns not in (0, own_unit_ns):
             raise RecordingError(
@@ -154,10 +156,9 @@ def _files(folder: Path, sweeps: Sweeps, rule: PointRule) -> list[_SweepFile]:
             )
         found[stamp_ns] = _SweepFile(stamp_ns, path, topic, sweeps, path.stat().st_size)
     # What cannot be read, and files without points, are counted when their turn comes.
-    first_ns = min(found, default=len(undated) + 1)
-    for back, path in enumerate(undated, 1):
-        size = path.stat().st_size
-        found[first_ns - back] = _SweepFile(first_ns - back, path, topic, sweeps, size)
+    begin_ns = min(found, default=len(undated) + 1)
+    for stamp_ns, path in enumerate(undated, begin_ns - len(undated)):
+        found[stamp_ns] = _SweepFile(stamp_ns, path, topic, sweeps, path.stat().st_size)
     files = sorted(found.values(), key=lambda file: file.stamp_ns)
     _check_first(files)
     return files
@@ -181,16 +182,6 @@ def _fault(file: _SweepFile) -> str:
     except SweepError as err:
         return str(err)
     return ""
-
-
-def _first_ns(path: Path, sweeps: Sweeps, rule: PointRule) -> int:
-    """The first time of the points of a file; 0 where it cannot be read."""
-    try:
-        return first_ns(path, sweeps, rule)
-    except SweepError as err:
-        if not rule.unit_ns:
-            raise RecordingError(f"{err} ({sweeps.place})") from err
-        return 0
 
 
 def _name_pattern(glob: str) -> re.Pattern[str]:

@@ -303,8 +303,7 @@ NAME = f"{START_NS}.bin"
         ({NAME: raw(FIELDS, POINTS)}, GLOB.replace("top/*.bin", "'top/{stamp:us}.bin'"),
          f"{NAME}: expected the time of the sweep as its name"),
         ({"1.bin": raw(FIELDS, POINTS)}, GLOB.replace("start", "absolute"),
-         "1.bin: expected the time of the sweep as its name, or points with times from 1970 as "
-         "`time` and `unit`, found fields x, y, z, intensity, t, ring and unit none; give both"),
+         "1.bin: expected the time of the sweep as its name (10 digits of s since 1970, 13"),
         ({NAME: _saved(**XYZ)}, "{glob: top/*.bin}",
          "expected one number for each point as array points, found points (392, 3) float64, "
          "level (392) uint8, ring (392) int64; give the arrays of the fields in the rig"),
