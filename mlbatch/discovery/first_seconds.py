@@ -43,6 +43,8 @@ KEPT_BYTES = 8 << 20
 _CHECKED = 16
 # Clouds farther apart by their log times need more than different delays of their drivers.
 _CLOUDS_APART_NS = 150 * NS_PER_MS
+# Topics that an error names.
+_TOPICS = 6
 
 
 class FirstSeconds:
@@ -247,7 +249,7 @@ def with_clouds(
     has_captures = any(not recording.topics for recording in recordings)
     is_raw = has_captures or any(map(has_packets, recorded))
     chosen = [cloud for name, cloud in clouds.items() if name in topics or not is_raw]
-    _refuse_points_of_packets(sensors, clouds)
+    _refuse_points_of_packets(sensors, clouds, sorted({topic.name for topic in recorded}))
     chosen = [topic for topic in chosen if topic.name not in ignore]
     if not chosen:
         return list(recordings), None
@@ -260,7 +262,9 @@ def with_clouds(
     return [CloudRecording(recording, table, found) for recording in recordings], found
 
 
-def _refuse_points_of_packets(sensors: Sequence[RigSensor], clouds: Collection[str]) -> None:
+def _refuse_points_of_packets(
+    sensors: Sequence[RigSensor], clouds: Collection[str], recorded: Sequence[str]
+) -> None:
     """Raise RigError for `points` of a sensor whose topic has no clouds."""
     lacking = {
         sensor.stream.topic: sensor.points.places
@@ -272,7 +276,10 @@ def _refuse_points_of_packets(sensors: Sequence[RigSensor], clouds: Collection[s
     for topic, places in lacking.items():
         place = next(iter(places.values()), "points")
         near = difflib.get_close_matches(topic, list(clouds), n=1, cutoff=0.0)
-        remedy = f"the nearest topic of clouds is {near[0]}" if near else "remove points"
+        remedy = f"the nearest topic of clouds is {near[0]}"
+        if not near:
+            topics = ", ".join(recorded[:_TOPICS]) + ", ..." * (len(recorded) > _TOPICS)
+            remedy = f"this recording has {topics}; give one of this rig, or remove points"
         others = [name for name in clouds if name not in near]
         also = f", others are {', '.join(others)}" if others else ""
         raise RigError(
