@@ -276,8 +276,9 @@ def _refuse_points_of_packets(
     for topic, places in lacking.items():
         place = next(iter(places.values()), "points")
         near = difflib.get_close_matches(topic, list(clouds), n=1, cutoff=0.0)
-        remedy = f"the nearest topic of clouds is {near[0]}"
-        if not near:
+        if near:
+            remedy = f"the nearest topic of clouds is {near[0]}"
+        else:
             topics = ", ".join(recorded[:_TOPICS]) + ", ..." * (len(recorded) > _TOPICS)
             remedy = f"this recording has {topics}; give one of this rig, or remove points"
         others = [name for name in clouds if name not in near]
