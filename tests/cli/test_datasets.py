@@ -479,3 +479,9 @@ def test_a_copy_of_a_recipe_is_a_rig(shell: Shell) -> None:
     Path("copy.yaml").write_text(copy.replace("title:", "titel:"))
     outcome = shell("convert ntu_day_01 --rig copy.yaml --dry-run")
     assert "copy.yaml:2: dataset.titel: expected a key of title" in outcome.err
+
+
+def test_a_recording_without_clouds_is_described(shell: Shell) -> None:
+    outcome = shell(f"convert {REPOSITORY}/fixtures/moving/moving.mcap --dataset tiers --dry-run")
+    assert outcome.code == 1
+    assert "found none; this recording has /imu/data, /left/imu_packets, " in outcome.err
