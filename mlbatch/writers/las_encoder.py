@@ -89,15 +89,10 @@ def record_layout(options: WriterOptions) -> RecordLayout | None:
     return RECORD
 
 
-def open_folder(
-    name: str,
-    target: Path,
-    info: RunInfo,
-    options: WriterOptions,
-    lazrs: ModuleType | None = None,
-) -> ScanWriter:
-    """Start a folder of LAS files, or of LAZ files by `lazrs`; name: of the format."""
+def open_folder(name: str, target: Path, info: RunInfo, options: WriterOptions) -> ScanWriter:
+    """Start a folder of LAS files, or of LAZ files; name: of the format."""
     check_dense(name, info)
+    lazrs = load_lazrs() if name == "laz" else None
     return FolderWriter(target, info, options, name, lambda: LasEncoder(lazrs))
 
 

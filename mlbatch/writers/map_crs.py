@@ -31,17 +31,14 @@ class MapCrs:
             # OGC 01-009 (WKT 1), which ends with a zero in LAS.
             self.wkt = crs.to_wkt("WKT1_GDAL").encode() + b"\0"
         except pyproj.exceptions.CRSError as err:
-            raise UsageError(
-                f"--crs: expected a known EPSG:NNNN, found {name!r}; write --crs EPSG:32633"
-            ) from err
+            text = f"--crs: expected a known EPSG:NNNN, found {name!r}; write --crs EPSG:32633"
+            raise UsageError(text) from err
         self.name = f"EPSG:{code}"
         plane = crs.sub_crs_list[0] if crs.is_compound else crs
         if not plane.is_projected or {axis.unit_name for axis in crs.axis_info} != {"metre"}:
             found = f"{plane.type_name} in {crs.axis_info[0].unit_name} ({crs.name})"
-            raise UsageError(
-                f"--crs: expected a projected system in metres, found {found}; give that of the "
-                "poses"
-            )
+            text = f"--crs: expected a projected system in metres, found {found}"
+            raise UsageError(f"{text}; give that of the poses")
         self._area = crs.area_of_use
         self._to_degrees = pyproj.Transformer.from_crs(plane, plane.geodetic_crs, always_xy=True)
 

@@ -33,8 +33,8 @@ from mlbatch.writers.voxel_filter import MOST_VOXELS, VoxelFilter
 UNITS_PER_M = 1000
 # The offset is the first pose, rounded to so many m: 0 in local frames.
 _OFFSET_STEP_M = 1000.0
-_LAS = (".laz", ".las")
-_LAYOUTS = {".ply": MAP_PLY, ".pcd": MAP_PCD}
+# Layouts of records by suffix; None: of LAS.
+_LAYOUTS = {".laz": None, ".las": None, ".ply": MAP_PLY, ".pcd": MAP_PCD}
 # Largest coordinates: of int32, and where float32 still has millimetres.
 _FARTHEST = {".pcd": 2**14 * UNITS_PER_M}
 # Types of extra bytes by their numbers in LAS, and the number of the record with text.
@@ -49,14 +49,13 @@ class MapWriter(ScanWriter):
         self, path: Path, voxel_m: float, crs: str | None, overwrite: bool, fsync: bool
     ) -> None:
         """voxel_m: a whole number of mm, 0: no voxels; crs: as EPSG:NNNN."""
-        self._path = path
         self._suffix = path.suffix.lower()
-        self._layout = _LAYOUTS.get(self._suffix)
-        if self._layout is None and self._suffix not in _LAS:
-            raise UsageError(
-                "--accumulate: expected the name of a .laz, .las, .ply or .pcd file, found "
-                f"{path}; write --accumulate map.laz"
+        if self._suffix not in _LAYOUTS:
+            text = (
+                f"--accumulate: expected the name of a .laz, .las, .ply or .pcd file, found {path}"
             )
+            raise UsageError(f"{text}; write --accumulate map.laz")
+        self._layout = _LAYOUTS[self._suffix]
         self._laspy: Any = None
         for name in ("lazrs", "laspy") if self._layout is None else ():
             self._laspy = load_lazrs(f"--accumulate {path}", name)
@@ -122,9 +121,9 @@ class MapWriter(ScanWriter):
         farthest = int(np.abs(units).max())
         if farthest >= self._farthest:
             raise ExportError(
-                f"{self._path}: expected points below {self._farthest // UNITS_PER_M} m from its "
-                f"offset, found {farthest // UNITS_PER_M} m in scan {scan.index}; write parts of "
-                "the drive (--start, --end), or a .laz without --voxel"
+                f"{self._output.target}: expected points below {self._farthest // UNITS_PER_M} m "
+                f"from its offset, found {farthest // UNITS_PER_M} m in scan {scan.index}; write "
+                "parts of the drive (--start, --end), or a .laz without --voxel"
             )
         records = np.asarray(record_bytes(self._records.of(scan))).reshape(len(units), -1)
         if self._voxels is not None:

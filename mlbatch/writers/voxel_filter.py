@@ -15,11 +15,9 @@ import numpy as np
 
 from mlbatch.arrays import I64Array
 
-# Bits of a coordinate in a block; its bytes: one bit per voxel.
-_SHIFT = 5
+# Bits of a coordinate in a block, and of that of a block, around the origin of the map.
+_SHIFT, _AXIS_BITS = 5, 21
 _BLOCK_BYTES = 1 << (3 * _SHIFT - 3)
-# Blocks are numbered by this many bits per axis, around the origin of the map.
-_AXIS_BITS = 21
 MOST_VOXELS = 1 << (_AXIS_BITS - 1 + _SHIFT)
 # The file grows by so many blocks. After so many scans all pages are unmapped: those in use return.
 _GROWTH = 4096

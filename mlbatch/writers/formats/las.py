@@ -5,10 +5,8 @@ Source: as of `las_encoder.py`, docs/sources/outputs.md section 6.
 
 from __future__ import annotations
 
-from pathlib import Path
+from functools import partial
 
-from mlbatch.types import RunInfo
-from mlbatch.writers.base import ScanWriter, WriterOptions
 from mlbatch.writers.las_encoder import extras, open_folder, record_layout
 
 __all__ = ["COMPRESSES", "FORMAT", "SUFFIX", "extras", "open_writer", "record_layout"]
@@ -16,8 +14,4 @@ __all__ = ["COMPRESSES", "FORMAT", "SUFFIX", "extras", "open_writer", "record_la
 FORMAT = "las"
 SUFFIX: str | None = None
 COMPRESSES = False
-
-
-def open_writer(target: Path, info: RunInfo, options: WriterOptions) -> ScanWriter:
-    """Start a folder of LAS files."""
-    return open_folder(FORMAT, target, info, options)
+open_writer = partial(open_folder, FORMAT)
