@@ -15,10 +15,7 @@ if TYPE_CHECKING:
 
 
 def check_map(job: Job, request: OutputRequest) -> None:
-    """Check the map that is asked for.
-
-    UsageError for options that contradict it, ExportError for a file that could not be written.
-    """
+    """Raise UsageError for options that contradict a map, ExportError for one over an input."""
     path = request.accumulate
     if path is None:
         option = "--crs" if request.voxel is None else "--voxel"
@@ -34,6 +31,7 @@ def check_map(job: Job, request: OutputRequest) -> None:
         ("--shard, since a map needs all scans in order", job.shard is not None),
         ("--batching-times own, since points of a map have one clock", job.batching_times == OWN),
         ("--split, since a map is of all lidars", job.split),
+        ("--report of the same name", request.report == path),
         ("--layout organized, since a map has no empty slots", job.layout == "organized"),
     ):
         if is_given:

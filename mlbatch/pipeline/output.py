@@ -128,9 +128,9 @@ class Output:
             self._map = MapWriter(
                 accumulated, request.voxel or 0.0, request.crs, request.overwrite, request.fsync
             )
-            # A map takes arrays, also of what only LAS stores.
-            names = self.job.extras | {"reflectivity"}
-            self.job = replace(self.job, extras=names, record=None)
+            # A map takes arrays, and nothing else but what LAS stores.
+            others = frozenset[str]() if path is None else self.job.extras
+            self.job = replace(self.job, extras=others | {"reflectivity"}, record=None)
 
     def _prepare(self, path: Path, warn: Listener) -> None:
         """Take the files of an interrupted run, or check that all can be made from the start."""

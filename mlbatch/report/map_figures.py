@@ -22,6 +22,7 @@ class MapFigures:
     def describe(self) -> str:
         """A line of the summary."""
         ends = zip(self.low_m, self.high_m, strict=True)
-        extent = " x ".join(f"{high - low:.1f}" for low, high in ends)
+        size = " x ".join(f"{high - low:.1f}" for low, high in ends)
         thinned = f" ({self.thinned} more in the same {self.voxel_m:g} m)" if self.voxel_m else ""
-        return f"map of {self.scans} scans: {self.points} points{thinned}, {extent} m {self.crs}"
+        text = f"map of {self.scans} scans: {self.points} points{thinned}, {size} m {self.crs}"
+        return text.rstrip()

@@ -25,7 +25,7 @@ from mlbatch.types import RunInfo, Scan, Summary
 from mlbatch.units import NS_PER_S
 from mlbatch.writers.atomic import export_errors, prepare
 from mlbatch.writers.base import ScanJob, ScanWriter
-from mlbatch.writers.las_encoder import EXTRA_BYTES, RECORD, VLR_USER, load_lazrs
+from mlbatch.writers.las_encoder import EXTRA_BYTES, RECORD, VLR_NUMBER, VLR_USER, load_lazrs
 from mlbatch.writers.map_crs import MapCrs
 from mlbatch.writers.point_layouts import MAP_PCD, MAP_PLY, ScanRecords, record_bytes
 from mlbatch.writers.voxel_filter import MOST_VOXELS, VoxelFilter
@@ -35,11 +35,8 @@ UNITS_PER_M = 1000
 _OFFSET_STEP_M = 1000.0
 # Layouts of records by suffix; None: of LAS.
 _LAYOUTS = {".laz": None, ".las": None, ".ply": MAP_PLY, ".pcd": MAP_PCD}
-# Largest coordinates: of int32, and where float32 still has millimetres.
-_FARTHEST = {".pcd": 2**14 * UNITS_PER_M}
-# Types of extra bytes by their numbers in LAS, and the number of the record with text.
+# Types of extra bytes by their numbers in LAS.
 _TYPES = {1: "u1", 3: "u2", 5: "u4", 9: "f4"}
-_MAP_VLR = 2
 
 
 class MapWriter(ScanWriter):
@@ -65,7 +62,9 @@ class MapWriter(ScanWriter):
         self._las: Any = None
         self._info = RunInfo((), "", "", "")
         edge = round(voxel_m * UNITS_PER_M)
-        self._farthest = min(_FARTHEST.get(self._suffix, 2**31), (edge or 2**31) * MOST_VOXELS)
+        # int32, and where float32 still has millimetres.
+        farthest = 2**14 * UNITS_PER_M if self._layout is MAP_PCD else 2**31
+        self._farthest = min(farthest, (edge or 2**31) * MOST_VOXELS)
         self._output = prepare(path, overwrite, folder=False, fsync=fsync)
         self._file = self._output.partial.open("r+b")
         with export_errors(path):
@@ -150,7 +149,7 @@ class MapWriter(ScanWriter):
         # As of scans: equal runs give equal bytes.
         header.creation_date = datetime.fromtimestamp(scan.start_ns // NS_PER_S, timezone.utc)
         lines = "\n".join(self._lines()).encode()
-        header.vlrs.append(laspy.VLR(VLR_USER, _MAP_VLR, "map", lines))
+        header.vlrs.append(laspy.VLR(VLR_USER, VLR_NUMBER + 1, "map", lines))
         if self._crs is not None:
             header.vlrs.append(laspy.VLR("LASF_Projection", 2112, "OGC WKT", self._crs.wkt))
         is_laz, backend = self._suffix == ".laz", laspy.LazBackend.Lazrs

@@ -6,6 +6,7 @@ x, y, z, reflectance), and docs/sources/outputs.md section 6.
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 
 from mlbatch.types import RecordLayout, RunInfo
@@ -34,12 +35,5 @@ def open_writer(target: Path, info: RunInfo, options: WriterOptions) -> ScanWrit
     """Start a folder of .bin files."""
     check_dense(FORMAT, info)
     (suffix,) = FILE_SUFFIXES
-    return FolderWriter(
-        target,
-        info,
-        options,
-        FORMAT,
-        lambda: RecordEncoder(ROWS_KITTI),
-        suffix=suffix,
-        lists={TIMES_TXT: times_text},
-    )
+    encoder, lists = partial(RecordEncoder, ROWS_KITTI), {TIMES_TXT: times_text}
+    return FolderWriter(target, info, options, FORMAT, encoder, suffix=suffix, lists=lists)

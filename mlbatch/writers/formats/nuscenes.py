@@ -8,6 +8,7 @@ points (lidarseg) in files of their own.
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 
 from mlbatch.types import RunInfo
@@ -31,13 +32,8 @@ def open_writer(target: Path, info: RunInfo, options: WriterOptions) -> ScanWrit
     """Start a folder of .pcd.bin and .time.bin files."""
     check_dense(FORMAT, info)
     points, times = FILE_SUFFIXES
+    encoder, others = partial(RecordEncoder, ROWS_NUSCENES), partial(RecordEncoder, ROWS_TIME)
+    lists = {TIMES_TXT: times_text}
     return FolderWriter(
-        target,
-        info,
-        options,
-        FORMAT,
-        lambda: RecordEncoder(ROWS_NUSCENES),
-        suffix=points,
-        others={times: lambda: RecordEncoder(ROWS_TIME)},
-        lists={TIMES_TXT: times_text},
+        target, info, options, FORMAT, encoder, suffix=points, others={times: others}, lists=lists
     )
