@@ -19,8 +19,7 @@ def check_map(job: Job, request: OutputRequest) -> None:
     path = request.accumulate
     if path is None:
         option = "--crs" if request.voxel is None else "--voxel"
-        text = f"{option}: expected --accumulate MAP, found none; leave it out"
-        raise UsageError(f"{text}, or write --accumulate map.laz")
+        raise UsageError(f"{option}: expected --accumulate MAP, found none; give both, or none")
     if job.deskew in ("", "imu", "constant-velocity"):
         raise UsageError(
             f"--accumulate {path}: expected --deskew FILE.tum, poses that place the scans, found "

@@ -25,7 +25,6 @@ class MapCrs:
                 f"--crs: expected the package pyproj, found none ({err}); {install_extra('crs')}"
             ) from err
         _, _, code = name.upper().partition("EPSG:")
-        # pyproj may come without types.
         try:
             crs: Any = pyproj.CRS.from_epsg(code)
             # OGC 01-009 (WKT 1), which ends with a zero in LAS.

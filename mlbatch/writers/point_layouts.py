@@ -389,10 +389,7 @@ PLY_LAYOUTS = {
 
 
 def _map_layout(name: str, kind: str, end: int) -> Layout:
-    """Points of a map: times are those of the clock; kind: of x, y and z, which end at a byte.
-
-    The writer fills in where they are.
-    """
+    """Points of a map, with times of the clock; kind: of x, y and z, which the writer fills in."""
     fields = (
         *(Field(axis, kind, at * end // 3) for at, axis in enumerate("xyz")),
         *(_intensity(end), Field("time", "<f8", end + 4, ("stamp_f8", 0))),

@@ -20,8 +20,7 @@ _SHIFT, _AXIS_BITS = 5, 21
 _BLOCK_BYTES = 1 << (3 * _SHIFT - 3)
 MOST_VOXELS = 1 << (_AXIS_BITS - 1 + _SHIFT)
 # The file grows by so many blocks. After so many scans all pages are unmapped: those in use return.
-_GROWTH = 4096
-_SCANS = 64
+_GROWTH, _SCANS = 4096, 64
 
 
 class VoxelFilter:
