@@ -52,7 +52,7 @@ def calibration_page(title: str, found: Calibration, command: str) -> str:
         lidars=found.rows(),
         pairs=found.pair_rows(),
         imus=found.imu_rows(),
-        notes=[imu.refusal for imu in found.imus if imu.refusal],
+        notes=found.notes()[bool(found.level) :],
         command=command,
     )
 

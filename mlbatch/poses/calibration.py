@@ -184,7 +184,12 @@ class Calibration:
 
     def notes(self) -> list[str]:
         """What is not known of IMUs, and what the IMU of the first lidar says of its pose."""
-        return [*filter(None, [self.level, *(imu.refusal for imu in self.imus)])]
+        refused: dict[str, list[str]] = {}
+        for imu in self.imus:
+            if imu.refusal:
+                refused.setdefault(imu.refusal.removeprefix(imu.name), []).append(imu.name)
+        imus = [f"{', '.join(names)}{reason}" for reason, names in refused.items()]
+        return [self.level, *imus] if self.level else imus
 
     def as_json(self) -> dict[str, object]:
         """The document of `--json`."""
