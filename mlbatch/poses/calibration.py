@@ -23,6 +23,7 @@ from mlbatch.poses.places import Places
 from mlbatch.poses.solve import (
     LEVELS,
     Cloud,
+    Known,
     Place,
     Problem,
     Solution,
@@ -294,24 +295,29 @@ def calibrated(
     *,
     delays: bool = False,
     guess: State | None = None,
+    known: Known | None = None,
 ) -> Calibration:
     """Refine poses (4, 4) body_from_sensor that the clouds of places were converted with.
 
-    delays: also solve for the delay of each lidar; guess: corrections to begin with, else none.
+    delays: also solve for the delay of each lidar; guess: corrections to begin with, else none;
+    known: what counts as surfaces do.
     Raises RecordingError with the reason where the recording does not determine them.
     """
     _refuse_few(places, names)
     begin = guess or State.start(len(names), 0)
     fitted = places.fitted()
-    found = find_poses(fitted, len(names), delays=delays, guess=_start(begin, len(fitted)))
+
+    def found_from(start: State) -> Solution:
+        return find_poses(fitted, len(names), delays=delays, guess=start, known=known)
+
+    found = found_from(_start(begin, len(fitted)))
     try:
-        return _measured(places, names, poses, begin, found, delays=delays)
+        return _measured(places, names, poses, begin, found, known, delays=delays)
     except RecordingError:
         better = better_start(fitted, found.state)
         if better is None:
             raise
-    found = find_poses(fitted, len(names), delays=delays, guess=better)
-    return _measured(places, names, poses, begin, found, delays=delays)
+    return _measured(places, names, poses, begin, found_from(better), known, delays=delays)
 
 
 def _measured(
@@ -320,6 +326,7 @@ def _measured(
     poses: Sequence[F64Array],
     begin: State,
     found: Solution,
+    known: Known | None,
     *,
     delays: bool,
 ) -> Calibration:
@@ -328,7 +335,7 @@ def _measured(
     _refuse_unseen(found, names)
     _refuse_undetermined(found, names, delays=delays)
     if not delays:
-        _refuse_late(fitted, found, names)
+        _refuse_late(Problem(fitted, len(names), delays=True, known=known), found, names)
     guessed = _corrected_poses(poses, begin)
     refined = _corrected_poses(poses, found.state)
     _refuse_far(names, guessed, refined)
@@ -375,6 +382,27 @@ def motion_poses(first: F64Array, motion: MotionPoses) -> list[F64Array]:
         own[:3, :3], own[:3, 3] = pose.first_from_lidar.rotation, pose.first_from_lidar.position_m
         found.append(rounded(compose(first, own)))
     return found
+
+
+def known_by_motion(
+    first: F64Array, motion: MotionPoses, moved: Sequence[F64Array], guess: State
+) -> Known:
+    """What motion says; first: (4, 4), of the first lidar; moved, guess: poses and state by motion.
+
+    Of lidars whose clocks differ it says the delay alone.
+    """
+    turned = np.kron(np.eye(2), first[:3, :3])
+    information = []
+    for pose, found in zip(moved[1:], motion.poses[1:], strict=True):
+        part = np.zeros((7, 7))
+        is_late = abs(found.late_s) > max(_LEAST_DELAY_S, 3.0 * found.late_sigma_s)
+        if not (found.refusal or is_late):
+            at = np.matmul(turned.T, _at(pose[:3, 3]))
+            part[:6, :6] = np.matmul(np.matmul(at.T, np.linalg.inv(found.covariance)), at)
+        if np.isfinite(found.late_s):
+            part[6, 6] = found.late_sigma_s**-2.0
+        information.append(part)
+    return Known(guess, information)
 
 
 def by_motion(
@@ -597,9 +625,9 @@ def _refuse_unseen(found: Solution, names: Sequence[str]) -> None:
             )
 
 
-def _refuse_late(places: Sequence[Place], found: Solution, names: Sequence[str]) -> None:
+def _refuse_late(problem: Problem, found: Solution, names: Sequence[str]) -> None:
     """Refuse poses that make up for timestamps that are late."""
-    late = solve(Problem(places, len(names), delays=True), found.state, LEVELS[-1])
+    late = solve(problem, found.state, LEVELS[-1])
     sigma_s = np.sqrt(np.diag(late.covariance))[6::7]
     for name, delay, sigma in zip(
         names[1:], late.state.delay_s[1:].tolist(), sigma_s.tolist(), strict=True

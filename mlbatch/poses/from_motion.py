@@ -21,7 +21,7 @@ from mlbatch.motion.se3 import exp_rotation, exp_transform, log_rotation, rotate
 from mlbatch.poses.hand_eye import Steps, hand_eye, known_rows
 from mlbatch.poses.solve import Cloud
 from mlbatch.poses.surfaces import planes
-from mlbatch.poses.turning import lidar_turns, turning
+from mlbatch.poses.turning import Turning, lidar_turns, turning
 from mlbatch.units import NS_PER_S
 
 # A map of 2 s drifts by some mm over 8 s.
@@ -74,7 +74,8 @@ class MotionPose:
     standard deviations of shift, m, and turn, rad, in the frame of the first lidar; covariance:
     (6, 6); weak: (6, w), unit directions of a shift or a turn that are known too badly to be used
     without a refinement; undetermined: the same in words; refusal: why there is no pose that a
-    refinement could start from, or "".
+    refinement could start from, or ""; late_s: of its stamps against the first lidar's, NaN where
+    the turns do not show it, with its standard deviation.
     """
 
     first_from_lidar: Pose
@@ -82,6 +83,8 @@ class MotionPose:
     weak: F64Array
     undetermined: tuple[str, ...]
     refusal: str
+    late_s: float = math.nan
+    late_sigma_s: float = math.nan
 
     @property
     def sigma(self) -> F64Array:
@@ -315,7 +318,9 @@ def _pose(
         f"{1000.0 * sigma:.2g} mm only; {_INSTEAD}"
         for way, sigma in _named_directions(shifts)
     ]
-    words += _late(first, other, middle_ns, names)
+    late = turning(first[:, 3:], middle_ns, lidar_turns(other[:, 3:], middle_ns), names[1])
+    words += _late(late, names)
+    late_s = math.nan if late.late_undetermined else late.delay_s
     worst = max((sigma for _, sigma in turns), default=0.0)
     refusal = ""
     if worst > _MOST_START_RAD:
@@ -330,14 +335,13 @@ def _pose(
         np.array(weak).reshape(-1, 6).T,
         tuple(words),
         refusal,
+        late_s,
+        late.delay_sigma_s,
     )
 
 
-def _late(
-    first: F64Array, other: F64Array, middle_ns: I64Array, names: tuple[str, str]
-) -> list[str]:
+def _late(found: Turning, names: tuple[str, str]) -> list[str]:
     """That the clocks of two lidars differ, which the law of their motions presumes they do not."""
-    found = turning(first[:, 3:], middle_ns, lidar_turns(other[:, 3:], middle_ns), names[1])
     late_s = found.delay_s
     if found.late_undetermined or abs(late_s) < max(_MOST_LATE_S, 5.0 * found.delay_sigma_s):
         return []

@@ -16,7 +16,7 @@ import numpy as np
 
 from mlbatch.arrays import F64Array, I64Array
 from mlbatch.motion.registration import ORIGIN, Pose
-from mlbatch.motion.se3 import exp_rotation, skew
+from mlbatch.motion.se3 import exp_rotation, log_rotation, skew
 from mlbatch.poses.stems import Stems, stem_distances, stems
 from mlbatch.poses.surfaces import Distances, Moments, Planes, distances
 from mlbatch.poses.votes import best_move
@@ -160,6 +160,29 @@ class Rows:
         return max(1.0, 1.4826 * float(np.partition(np.abs(self.residual), middle)[middle]))
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Known:
+    """What is known of all lidars but the first without surfaces, as by their motion.
+
+    state: corrections and delays; information: of each of these lidars (7, 7), inverse covariance
+    of a shift at the body origin, m, a turn, rad, and the delay, s.
+    """
+
+    state: State
+    information: Sequence[F64Array]
+
+    def off(self, state: State) -> F64Array:
+        """How far a state is from it (lidars - 1, 7)."""
+        rows = []
+        for lidar in range(1, len(state.corrections)):
+            pose, other = state.corrections[lidar], self.state.corrections[lidar]
+            turn = np.matmul(pose.rotation, other.rotation.T)
+            shift_m = pose.position_m - np.matmul(turn, other.position_m)
+            late_s = state.delay_s[lidar] - self.state.delay_s[lidar]
+            rows.append(np.concatenate([shift_m, log_rotation(turn[None])[0], [late_s]]))
+        return np.array(rows)
+
+
 class Problem:
     """Least squares over places.
 
@@ -167,12 +190,31 @@ class Problem:
     `delays`, then 6 for each place.
     """
 
-    def __init__(self, places: Sequence[Place], lidars: int, *, delays: bool = False) -> None:
+    def __init__(
+        self,
+        places: Sequence[Place],
+        lidars: int,
+        *,
+        delays: bool = False,
+        known: Known | None = None,
+    ) -> None:
         self.places = places
         self.lidars = lidars
         self.each = 7 if delays else 6
         self.poses = self.each * (lidars - 1)
+        self._known = known
         self._stems: dict[tuple[int, int], Stems] = {}
+
+    def known(self, state: State) -> tuple[F64Array, F64Array]:
+        """Information (poses, poses) that is known before, and its slope (poses,) at a state."""
+        information, slope = np.zeros((self.poses, self.poses)), np.zeros(self.poses)
+        if self._known is not None:
+            for number, off in enumerate(self._known.off(state)):
+                at = slice(self.each * number, self.each * (number + 1))
+                part = self._known.information[number][: self.each, : self.each]
+                information[at, at] = part
+                slope[at] = np.matmul(part, off[: self.each])
+        return information, slope
 
     def clouds(self, place: int, state: State, edge_m: float) -> list[Planes]:
         """Planes of the clouds of a place, moved to its instant."""
@@ -346,7 +388,12 @@ def estimate(problem: Problem, state: State, level: Level, steps: int = 3) -> So
 
 
 def find_poses(
-    places: Sequence[Place], lidars: int, *, delays: bool = False, guess: State | None = None
+    places: Sequence[Place],
+    lidars: int,
+    *,
+    delays: bool = False,
+    guess: State | None = None,
+    known: Known | None = None,
 ) -> Solution:
     """Solve for the poses of all lidars, coarse to fine.
 
@@ -354,7 +401,7 @@ def find_poses(
     1 m off.
     """
     state = guess or State.start(lidars, len(places))
-    problem = Problem(places, lidars)
+    problem = Problem(places, lidars, known=known)
     afar, *coarse, fine = _SEARCH
     for _ in range(_MOST_VOTES):
         state = solve(problem, state, afar).state
@@ -362,7 +409,7 @@ def find_poses(
             break
     for level in coarse:
         state = solve(problem, state, level).state
-    return solve(Problem(places, lidars, delays=delays), state, fine)
+    return solve(Problem(places, lidars, delays=delays, known=known), state, fine)
 
 
 def better_start(places: Sequence[Place], end: State) -> State | None:
@@ -461,6 +508,7 @@ class _Equations:
         self.problem = problem
         self._rows = rows
         self._twists = state.twists
+        self._information, self._slope = problem.known(state)
         self._prior = np.array([_SPEED_MPS**-2.0] * 3 + [_TURN_RADPS**-2.0] * 3)
         self._units = np.ones(problem.poses)
         for lidar in range(problem.lidars - 1):
@@ -479,7 +527,7 @@ class _Equations:
         """Change of all unknowns."""
         size = self.problem.poses
         damped = _STEP_M**-2.0 / self._units**2
-        normal, gradient = np.diag(damped), np.zeros(size)
+        normal, gradient = np.diag(damped) + self._information, self._slope.copy()
         lever = np.array([1.0] * 3 + [_LEVER_M] * 3)
         kept = []
         for part, residual, off, twist in zip(
@@ -521,7 +569,8 @@ class _Equations:
         size = self.problem.poses
         if not size:
             return np.zeros((0, 0)), np.zeros((0, 0))
-        plain, true = np.zeros((2, size, size))
+        known_before = self._information * self._units * self._units[:, None]
+        plain, true = known_before.copy(), known_before.copy()
         scores, levers, noises, blocks = [], [], [], []
         for part, residual, off in zip(self._rows, self._residual, self._off, strict=True):
             jacobian, noise = part.jacobian / part.scale, part.noise / part.scale
@@ -553,10 +602,13 @@ class _Equations:
         np.add.at(summed, number, np.matmul(score, axes))
         summed *= inverse
         covariance = np.matmul(summed.T, summed) * (count / max(1.0, count - size))
+        before = np.matmul(np.matmul(axes.T, known_before), axes)
+        covariance += before * inverse * inverse[:, None]
         by_block = np.zeros((count, size))
         np.add.at(by_block, number, np.matmul(lever, axes) ** 2 - np.matmul(noise, axes) ** 2)
         effective = by_block.sum(axis=0) ** 2 / np.maximum((by_block**2).sum(axis=0), 1e-12)
-        seen &= (effective >= _FEWEST_BLOCKS) & (np.diag(covariance) < _MOST_SIGMA_M**2)
+        is_enough = (effective >= _FEWEST_BLOCKS) | (np.diag(before) > _MOST_SIGMA_M**-2.0)
+        seen &= is_enough & (np.diag(covariance) < _MOST_SIGMA_M**2)
         covariance[~seen] = 0.0
         covariance[:, ~seen] = 0.0
         covariance += np.diag(np.where(seen, 0.0, _UNKNOWN_M**2))

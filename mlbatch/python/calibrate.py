@@ -6,6 +6,7 @@ import contextlib
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from dataclasses import replace
 from datetime import date
+from functools import partial
 from itertools import islice
 from pathlib import Path
 
@@ -17,7 +18,7 @@ from mlbatch.discovery.gravity import ups, vertical_of
 from mlbatch.errors import ExportError, NoScanError, RecordingError, RigError, UsageError
 from mlbatch.frames.transforms import compose, inverse, rpy_deg
 from mlbatch.motion.gravity import standing_gravity, tilt_deg
-from mlbatch.motion.registration import Pose
+from mlbatch.motion.registration import ORIGIN, Pose
 from mlbatch.motion.se3 import exp_rotation
 from mlbatch.pipeline.conversion import Conversion, Progress
 from mlbatch.pipeline.deskew import ImuStreams
@@ -31,6 +32,7 @@ from mlbatch.poses.calibration import (
     by_motion,
     calibrated,
     imu_note,
+    known_by_motion,
     motion_poses,
     numbers,
     rounded,
@@ -203,35 +205,45 @@ def _calibrated(
 ) -> tuple[Calibration, MotionPoses | None]:
     job = run.job
     poses = [sensor.pose.body_from_sensor for sensor in run.session.setup.sensors]
-    if not from_motion:
-        return calibrated(_places(run, progress), names, poses, delays=time_offset), None
+    if not (from_motion or time_offset):
+        return calibrated(_places(run, progress), names, poses), None
     with contextlib.closing(_scans(run, progress)) as scans:
         motion = poses_from_motion(_motion_windows(scans, poses), names)
-    if motion.refusal:
+    if from_motion and motion.refusal:
         raise RecordingError(f"calibrate: {motion.refusal}")
     moved = motion_poses(poses[0], motion)
-    guess = State.start(len(names), 0)
-    guess.corrections = [
+    by_turns = State.start(len(names), 0)
+    by_turns.corrections = [
         Pose(change[:3, :3], change[:3, 3])
         for change in (compose(new, inverse(old)) for new, old in zip(moved, poses, strict=True))
     ]
+    if time_offset:
+        by_turns.delay_s = -np.nan_to_num([pose.late_s for pose in motion.poses])
+    guess = by_turns if from_motion else replace(by_turns, corrections=[ORIGIN] * len(names))
     places = _places(Conversion(job), progress)
+    refined = partial(calibrated, places, names, poses, delays=time_offset, guess=guess)
     try:
-        found = calibrated(places, names, poses, delays=time_offset, guess=guess)
-    except Undetermined as err:
-        if time_offset:
-            raise
-        if motion.undetermined:
+        found = refined()
+    except Undetermined:
+        if from_motion and not (time_offset or motion.undetermined):
+            return by_motion(names, moved, motion, places.windows), motion
+        known = known_by_motion(poses[0], motion, moved, by_turns)
+        try:
+            found = refined(known=known)
+        except Undetermined as err:
+            if time_offset:
+                raise
             # Each ends with the same remedy.
             words = [direction.partition("; ") for direction in motion.undetermined]
             raise Undetermined(
-                "calibrate: expected surfaces in common or motion that fix the poses, found "
+                "calibrate: expected surfaces in common and motion that fix the poses, found "
                 f"neither: {'; '.join(word for word, _, _ in words)}; {words[-1][2]}"
             ) from err
-        return by_motion(names, moved, motion, places.windows), motion
+    if not from_motion:
+        return found, motion
     back = inverse(found.lidars[0].body_from_sensor)
-    refined = [compose(back, lidar.body_from_sensor) for lidar in found.lidars]
-    if wrong := contradiction(motion, [Pose(own[:3, :3], own[:3, 3]) for own in refined], names):
+    relative = [compose(back, lidar.body_from_sensor) for lidar in found.lidars]
+    if wrong := contradiction(motion, [Pose(own[:3, :3], own[:3, 3]) for own in relative], names):
         raise RecordingError(f"calibrate: {wrong}")
     return found, motion
 

@@ -19,8 +19,15 @@ from mlbatch.errors import RecordingError, UsageError
 from mlbatch.frames.transforms import compose, from_rpy_deg, inverse
 from mlbatch.motion.registration import ORIGIN, Pose
 from mlbatch.motion.se3 import log_rotation
-from mlbatch.poses.calibration import Calibration, LidarPose, by_motion, motion_poses
+from mlbatch.poses.calibration import (
+    Calibration,
+    LidarPose,
+    by_motion,
+    known_by_motion,
+    motion_poses,
+)
 from mlbatch.poses.from_motion import MotionPose, MotionPoses
+from mlbatch.poses.solve import State
 from mlbatch.python.calibrate import calibrate_job, rig_text
 from mlbatch.rig.rig import Rig, read_rig
 from mlbatch.rig.write import write_rig
@@ -253,3 +260,32 @@ def test_deviations_of_motion_are_those_along_the_body() -> None:
     assert (found.steps, found.windows, found.pairs) == (38, 44, ())
     assert found.lidars[1].sigma_mm == pytest.approx([2, 1, 3])
     assert found.lidars[1].sigma_deg == pytest.approx(np.rad2deg([0.02, 0.01, 0.03]))
+
+
+@pytest.mark.parametrize("late_s", [np.nan, 0.001, 0.05])
+def test_what_motion_says_counts_in_the_body_frame(late_s: float) -> None:
+    """A pose that is off by e costs e' C^-1 e, in the frame of the first lidar; C: by motion."""
+    rng = np.random.default_rng(1)
+    spread = rng.normal(size=(6, 6)) * 0.01
+    covariance = spread @ spread.T + np.diag([1e-4] * 6)
+    first = from_rpy_deg([0.4, -0.3, 2.0], [10, 20, 90])
+    relative = from_rpy_deg([1.0, -0.5, 0.2], [5, -10, 120])
+    own = MotionPose(
+        *(Pose(relative[:3, :3], relative[:3, 3]), covariance, _NO_AXES, (), "", late_s, 0.002)
+    )
+    still = MotionPose(ORIGIN, np.zeros((6, 6)), _NO_AXES, (), "")
+    motion = MotionPoses((still, own), (40, 38), np.zeros(40, np.int64), np.zeros((2, 40, 6)))
+    moved = motion_poses(first, motion)
+    known = known_by_motion(first, motion, moved, State.start(2, 0))
+    change = from_rpy_deg([2e-4, -1e-4, 3e-4], [0.01, -0.02, 0.015])
+    state = State.start(2, 0)
+    state.corrections[1] = Pose(change[:3, :3], change[:3, 3])
+    off = known.off(state)[0]
+    cost = off[:6] @ known.information[0][:6, :6] @ off[:6]
+    after = compose(inverse(first), compose(change, moved[1]))
+    turn = log_rotation((after[:3, :3] @ relative[:3, :3].T)[None])[0]
+    error = np.concatenate([after[:3, 3] - relative[:3, 3], turn])
+    expected = error @ np.linalg.solve(covariance, error)
+    # Of clocks that differ by 50 ms, poses by motion are not right.
+    assert cost == pytest.approx(0.0 if late_s == 0.05 else expected, rel=0.01)
+    assert known.information[0][6, 6] == pytest.approx(0.0 if np.isnan(late_s) else 0.002**-2)

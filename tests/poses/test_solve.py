@@ -7,9 +7,10 @@ import pytest
 
 from mlbatch.arrays import F64Array
 from mlbatch.motion.registration import ORIGIN, Pose
-from mlbatch.motion.se3 import exp_transform, log_rotation
+from mlbatch.motion.se3 import exp_rotation, exp_transform, log_rotation
 from mlbatch.poses.solve import (
     FINE,
+    Known,
     Problem,
     Solution,
     State,
@@ -151,6 +152,32 @@ def test_no_start_determines_what_the_scene_leaves_open(faces: tuple[Face, ...])
     places = [rig.place(rng, (faces, faces), 9000) for _ in range(2)]
     better = better_start(places, State.start(2, 2))
     assert find_poses(places, 2, guess=better).weak.shape[1] > 0
+
+
+@pytest.mark.parametrize(("sigma_m", "is_enough"), [(0.002, True), (0.02, False)])
+def test_what_is_known_without_surfaces_closes_what_they_leave_open(
+    sigma_m: float, is_enough: bool
+) -> None:
+    """On a bare plane x, y and yaw, as motion on flat ground says; the plane fixes the rest."""
+    rig = Rig((ORIGIN, NEAR), TWIST)
+    rng = np.random.default_rng(7)
+    sigma = np.array([sigma_m, sigma_m, np.inf, np.inf, np.inf, sigma_m / LEVER_M, np.inf])
+    drawn = np.where(np.isfinite(sigma[:6]), sigma[:6], [0, 0, 0.3, 0.002, 0.002, 0])
+    drawn *= rng.normal(size=6)
+    turn = exp_rotation(drawn[None, 3:])[0] @ NEAR.rotation.T
+    stated = Pose(turn, drawn[:3] - turn @ NEAR.position_m)
+    known = Known(State([ORIGIN, stated], np.zeros((0, 6)), np.zeros(2)), [np.diag(sigma**-2.0)])
+    places = [rig.place(rng, ((GROUND,),) * 2, 9000) for _ in range(2)]
+    found = find_poses(places, 2, known=known)
+    if not is_enough:
+        assert found.weak.shape[1] > 0
+        return
+    assert found.weak.shape == (6, 0)
+    deviation = np.sqrt(np.diag(found.covariance))
+    error = errors(rig, found)[0]
+    assert (np.abs(error) < 4 * deviation).all()
+    assert deviation[[0, 1]] == pytest.approx(np.hypot(sigma_m, 0.001), rel=0.3)
+    assert np.abs(error[[2, 3, 4]] / [1, 1 / LEVER_M, 1 / LEVER_M]).max() < 0.003
 
 
 def test_without_points_all_is_open() -> None:
