@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from mlbatch.arrays import F64Array, I64Array
+from mlbatch.motion.se3 import skew
 from mlbatch.simulate.interface import Sent, Shots
 from mlbatch.simulate.models import simulated_lidar
 from mlbatch.simulate.rays import Rays
@@ -167,7 +168,7 @@ class LidarStream:
         origin = np.matmul(shots.origin_m, turned) + place[:, None]
         if delay_s.any():
             later = delay_s[..., None]
-            spin = np.matmul(poses.rotation, _cross_matrix(poses.angular_velocity))
+            spin = np.matmul(poses.rotation, skew(poses.angular_velocity))
             turning = np.matmul(spin, turn).transpose(0, 2, 1)
             speed = np.matmul(spin, arm) + poses.velocity
             direction += later * np.matmul(shots.direction, turning)
@@ -224,14 +225,6 @@ def _spread(rays: Rays, divergence_rad: float, random: np.random.Generator) -> N
     direction = rays.direction
     direction += sigma * random.standard_normal(direction.shape, dtype=np.float32)
     direction /= np.sqrt(np.einsum("in,in->n", direction, direction))
-
-
-def _cross_matrix(vectors: F64Array) -> F64Array:
-    """Return matrices (n, 3, 3) that multiply by vectors (n, 3) from the left, crosswise."""
-    x, y, z = vectors.T
-    nothing = np.zeros(len(vectors))
-    rows = ((nothing, -z, y), (z, nothing, -x), (-y, x, nothing))
-    return np.stack([np.stack(row, axis=-1) for row in rows], axis=1)
 
 
 def with_errors(

@@ -12,16 +12,14 @@ from datetime import datetime
 import numpy as np
 import pytest
 
-from mlbatch.arrays import F64Array, U8Array
+from mlbatch.arrays import U8Array
 from mlbatch.simulate.robosense.encode import RobosenseSpec
 from mlbatch.simulate.velodyne.encode import (
-    Rays,
     VelodyneSpec,
     directions,
     encode,
     firing_times_ns,
     gprmc,
-    observe,
     origins,
     position_packets,
 )
@@ -189,19 +187,6 @@ def test_rays_of_a_velodyne(
 def test_azimuth_of_a_beam_of_a_vls_128() -> None:
     x, y, _ = directions(VelodyneSpec("VLS-128", rpm=0), FIRST_COLUMN)[0, 8].tolist()
     assert math.degrees(math.atan2(-y, x)) == pytest.approx(6.354)
-
-
-def test_a_wall_5_m_ahead() -> None:
-    def see(rays: Rays) -> tuple[F64Array, F64Array]:
-        with np.errstate(divide="ignore"):
-            distance_m = (5.0 - rays.origin[..., 0]) / rays.direction[..., 0]
-        ahead = np.where(rays.direction[..., 0] > 0, distance_m, np.inf)
-        return ahead, np.full(rays.time_ns.shape, 77.0)
-
-    # Laser 5: level, 1.4 degrees to the left, 4.608 us late: 5 / cos(1.38341) = 5.001458 m.
-    check_bytes(observe(VelodyneSpec("VLP-32C"), 1, see).payloads[0], "19 e2044d")
-    behind = observe(VelodyneSpec("VLP-32C", start_azimuth_deg=180), 1, see).payloads[0]
-    assert not behind[4:100].any()
 
 
 def test_position_packets() -> None:

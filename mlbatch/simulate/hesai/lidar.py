@@ -5,9 +5,11 @@ Source: docs/sources/hesai.md sections 2 to 8, by way of the encoder.
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
-from mlbatch.arrays import F64Array, I64Array
+from mlbatch.arrays import F64Array
 from mlbatch.simulate.hesai.angles import Angles, Beams, MirrorAngles, angles_csv, fan
 from mlbatch.simulate.hesai.encode import (
     HesaiSpec,
@@ -20,14 +22,15 @@ from mlbatch.simulate.hesai.encode import (
 )
 from mlbatch.simulate.hesai.models import MODELS as ROWS
 from mlbatch.simulate.interface import (
-    ImuUnit,
     LidarFiles,
     LidarModel,
     LidarSettings,
     PacketTopic,
     Sent,
     Shots,
-    whole_counts,
+    SpinningLidar,
+    readings,
+    shots_of,
 )
 from mlbatch.units import NS_PER_S, RAD_PER_DEG
 
@@ -55,12 +58,7 @@ MODELS = tuple(
 )
 
 
-def simulated(settings: LidarSettings) -> SimulatedHesai:
-    """Return the lidar."""
-    return SimulatedHesai(settings)
-
-
-class SimulatedHesai:
+class SimulatedHesai(SpinningLidar):
     """Firing groups follow each other without a gap."""
 
     def __init__(self, settings: LidarSettings) -> None:
@@ -82,9 +80,7 @@ class SimulatedHesai:
             mirrors = MirrorAngles(_MIRROR_STARTS_DEG, elevation, azimuth)
             self._beams = mirrors
             self.files = LidarFiles("dat", mirrors.dat())
-        self.rig_model = ""
         self.topics = {DATA_PORT: PacketTopic("hesai_packets", _TYPE)}
-        self.imu: ImuUnit | None = None
         self._columns = _CHUNK_PACKETS * self._spec.groups
         self.chunk_s = float(row.step_ns * self._columns) / NS_PER_S
 
@@ -93,32 +89,23 @@ class SimulatedHesai:
         spec = advanced(self._spec, chunk * _CHUNK_PACKETS)
         time_ns = firing_times_ns(spec, self._columns)
         fired = fires(spec, self._columns)
-        first_ns = np.where(fired, time_ns, time_ns.max()).min(axis=1)
-        delay_s: F64Array = (time_ns - first_ns[:, None]) / NS_PER_S
         direction = directions(spec, self._beams, self._columns)
+        shots = shots_of(time_ns, np.zeros((1, 1, 3)), direction, fired)
         if self._has_mirrors:
             # The middle of the field is at twice 60 degrees of the mirror.
             azimuth = np.arctan2(direction[..., 0], direction[..., 1]) / RAD_PER_DEG % 360.0
-            fired = fired & (np.abs(azimuth - 120.0) <= _HALF_VIEW_DEG)
-        return Shots(first_ns, delay_s, np.zeros((1, 1, 3)), direction, fired)
+            return replace(shots, fires=fired & (np.abs(azimuth - 120.0) <= _HALF_VIEW_DEG))
+        return shots
 
     def packets(self, chunk: int, distance_m: F64Array, reflectivity: F64Array) -> list[Sent]:
         """Packets of a chunk."""
         spec = advanced(self._spec, chunk * _CHUNK_PACKETS)
-        counts = whole_counts(distance_m, spec.row.unit_mm / 1000.0, _LARGEST, None)
-        level = np.where(counts > 0, np.rint(reflectivity), 0.0).astype(np.int64)
-        shape = (*counts.shape, spec.returns)
-        payloads = encode_packets(
-            spec,
-            np.broadcast_to(counts[..., None], shape),
-            np.broadcast_to(level[..., None], shape),
-        )
+        unit_m = spec.row.unit_mm / 1000.0
+        values = readings(distance_m, reflectivity, unit_m, _LARGEST, spec.returns)
+        payloads = encode_packets(spec, *values)
         last_ns = firing_times_ns(spec, self._columns).reshape(_CHUNK_PACKETS, -1).max(axis=1)
         ready_ns = np.maximum(last_ns, packet_times_ns(spec, _CHUNK_PACKETS)).tolist()
         return [Sent(at, DATA_PORT, one) for at, one in zip(ready_ns, payloads, strict=True)]
 
-    def imu_packets(
-        self, time_ns: I64Array, acceleration: F64Array, angular_velocity: F64Array
-    ) -> list[Sent]:
-        """None: its IMU is not supported."""
-        return []
+
+simulated = SimulatedHesai

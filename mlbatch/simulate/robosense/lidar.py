@@ -9,16 +9,16 @@ from dataclasses import replace
 
 import numpy as np
 
-from mlbatch.arrays import F64Array, I64Array
+from mlbatch.arrays import F64Array
 from mlbatch.simulate.interface import (
-    ImuUnit,
-    LidarFiles,
     LidarModel,
     LidarSettings,
     PacketTopic,
     Sent,
     Shots,
-    whole_counts,
+    SpinningLidar,
+    readings,
+    shots_of,
 )
 from mlbatch.simulate.robosense.encode import (
     RobosenseSpec,
@@ -52,12 +52,7 @@ MODELS = tuple(
 )
 
 
-def simulated(settings: LidarSettings) -> SimulatedRobosense:
-    """Return the lidar."""
-    return SimulatedRobosense(settings)
-
-
-class SimulatedRobosense:
+class SimulatedRobosense(SpinningLidar):
     """Firing rounds follow each other without a gap."""
 
     def __init__(self, settings: LidarSettings) -> None:
@@ -71,13 +66,10 @@ class SimulatedRobosense:
             serial=f"{settings.serial:012d}"[-12:],
         )
         self._angles = fan(self._spec)
-        self.rig_model = ""
-        self.files = LidarFiles()
         self.topics = {
             MSOP_PORT: PacketTopic("rslidar_packets", _TYPE),
             DIFOP_PORT: PacketTopic("rslidar_packets", _TYPE, of_device=True),
         }
-        self.imu: ImuUnit | None = None
         self._columns = np.arange(round(_CHUNK_PACKETS * self._spec.columns_per_packet))
         self.chunk_s = len(self._columns) * self._spec.round_ns / NS_PER_S
         is_airy = settings.model.startswith("Airy")
@@ -88,32 +80,19 @@ class SimulatedRobosense:
         """Rays of the columns of a chunk."""
         spec = advanced(self._spec, chunk * _CHUNK_PACKETS)
         time_ns = firing_times_ns(spec, self._columns)
-        first_ns = time_ns.min(axis=1)
-        delay_s: F64Array = (time_ns - first_ns[:, None]) / NS_PER_S
         direction = directions(spec, self._angles, self._columns)
-        return Shots(first_ns, delay_s, origins(spec, self._columns), direction)
+        return shots_of(time_ns, origins(spec, self._columns), direction)
 
     def packets(self, chunk: int, distance_m: F64Array, reflectivity: F64Array) -> list[Sent]:
         """Packets of a chunk, and device packets of the same time."""
         spec = advanced(self._spec, chunk * _CHUNK_PACKETS)
         # Receive times are those of the simulation.
         spec = replace(spec, latency_ns=0)
-        counts = whole_counts(distance_m, spec.range_unit_m, self._largest, None)
-        level = np.where(counts > 0, np.rint(reflectivity), 0.0).astype(np.int64)
-        shape = (*counts.shape, spec.returns)
-        payloads = msop(
-            spec,
-            np.broadcast_to(counts[..., None] + self._flag, shape),
-            np.broadcast_to(level[..., None], shape),
+        counts, level = readings(
+            distance_m, reflectivity, spec.range_unit_m, self._largest, spec.returns
         )
-        data = [Sent(at, MSOP_PORT, payload) for at, payload in payloads]
+        data = [Sent(at, MSOP_PORT, one) for at, one in msop(spec, counts + self._flag, level)]
         return data + self._device_packets(chunk)
-
-    def imu_packets(
-        self, time_ns: I64Array, acceleration: F64Array, angular_velocity: F64Array
-    ) -> list[Sent]:
-        """None: its IMU is not supported."""
-        return []
 
     def _device_packets(self, chunk: int) -> list[Sent]:
         chunk_ns = len(self._columns) * self._spec.round_ns
@@ -123,3 +102,6 @@ class SimulatedRobosense:
             self._spec.start_ns + first, self._spec.start_ns + begin_ns + chunk_ns, _DIFOP_NS
         )
         return [Sent(at, DIFOP_PORT, difop(self._spec, self._angles, time_ns=at)) for at in times]
+
+
+simulated = SimulatedRobosense

@@ -8,7 +8,6 @@ number out. Returns are in the order of the wire: last, strongest (HDL-64E: stro
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from datetime import datetime, timedelta, timezone
 
@@ -91,21 +90,6 @@ class Sent:
     host_ns: I64Array
 
 
-@dataclass(frozen=True)
-class Rays:
-    """Where the lasers of columns (n,) look as they fire, in the sensor frame (x forward, y left).
-
-    time_ns: (n, lasers), since 1970; azimuth_rad: (n, lasers), of the rotor, clockwise; origin,
-    direction: (n, lasers, 3), m and unit vectors.
-    """
-
-    columns: I64Array
-    time_ns: I64Array
-    azimuth_rad: F64Array
-    origin: F64Array
-    direction: F64Array
-
-
 def encode(spec: VelodyneSpec, distance: I64Array, level: I64Array) -> Sent:
     """Packets with these counts of distance and levels, each (columns, lasers, returns)."""
     table = spec.table
@@ -137,38 +121,6 @@ def advanced(spec: VelodyneSpec, packets: int) -> VelodyneSpec:
     after_us = packets * spec.rows_per_packet * spec.row_us
     azimuth_deg = float(_azimuth_deg(spec, np.array([after_us]))[0]) % 360.0
     return replace(spec, start_us=spec.start_us + after_us, start_azimuth_deg=azimuth_deg)
-
-
-def observe(
-    spec: VelodyneSpec, packets: int, see: Callable[[Rays], tuple[F64Array, F64Array]]
-) -> Sent:
-    """Packets of a sensor whose rays meet what `see` says.
-
-    It gives true distances in m from the rays' origins (inf: none) and levels, each (n, lasers)
-    for one return or (n, lasers, returns).
-    """
-    columns = np.arange(packets * spec.columns_per_packet)
-    distance_m, level = (
-        np.broadcast_to(values.reshape(*values.shape[:2], -1), (*values.shape[:2], spec.returns))
-        for values in see(rays(spec, columns))
-    )
-    counts = (distance_m - np.array(spec.table.dist_m)[:, None]) / spec.table.unit_m
-    with np.errstate(invalid="ignore"):
-        fits = (counts >= 0.5) & (counts < 65535.5)
-    raw = np.rint(np.where(fits, counts, 0.0)).astype(np.int64)
-    return encode(spec, raw, np.where(raw > 0, np.rint(level), 0).astype(np.int64))
-
-
-def rays(spec: VelodyneSpec, columns: I64Array) -> Rays:
-    """Where the lasers look when they fire."""
-    azimuth_rad = np.deg2rad(_azimuth_deg(spec, _firing_us(spec, columns)))
-    return Rays(
-        columns,
-        firing_times_ns(spec, columns),
-        azimuth_rad,
-        origins(spec, columns),
-        directions(spec, columns),
-    )
 
 
 def firing_times_ns(spec: VelodyneSpec, columns: I64Array) -> I64Array:

@@ -7,16 +7,17 @@ from __future__ import annotations
 
 import numpy as np
 
-from mlbatch.arrays import F64Array, I64Array
+from mlbatch.arrays import F64Array
 from mlbatch.simulate.interface import (
-    ImuUnit,
     LidarFiles,
     LidarModel,
     LidarSettings,
     PacketTopic,
     Sent,
     Shots,
-    whole_counts,
+    SpinningLidar,
+    readings,
+    shots_of,
 )
 from mlbatch.simulate.velodyne.encode import (
     VelodyneSpec,
@@ -42,12 +43,7 @@ _CHUNK_PACKETS = 48
 MODELS = tuple(LidarModel(name, ("strongest", "last", "dual")) for name in TABLES)
 
 
-def simulated(settings: LidarSettings) -> SimulatedVelodyne:
-    """Return the lidar."""
-    return SimulatedVelodyne(settings)
-
-
-class SimulatedVelodyne:
+class SimulatedVelodyne(SpinningLidar):
     """Firing sequences follow each other without a gap."""
 
     def __init__(self, settings: LidarSettings) -> None:
@@ -66,7 +62,6 @@ class SimulatedVelodyne:
         text = calibration_yaml(settings.model) if needs_file else ""
         self.files = LidarFiles("yaml" if needs_file else "", text.encode())
         self.topics = {DATA_PORT: PacketTopic("velodyne_packets", "velodyne_msgs/VelodyneScan")}
-        self.imu: ImuUnit | None = None
         packet_us = self._spec.rows_per_packet * self._spec.row_us
         self.chunk_s = _CHUNK_PACKETS * packet_us * 1e-6
         self._packet_us = packet_us
@@ -79,25 +74,14 @@ class SimulatedVelodyne:
         """Rays of the columns of a chunk."""
         spec = advanced(self._spec, chunk * _CHUNK_PACKETS)
         time_ns = firing_times_ns(spec, self._columns)
-        first_ns = time_ns.min(axis=1)
-        delay_s: F64Array = (time_ns - first_ns[:, None]) / NS_PER_S
-        return Shots(
-            first_ns, delay_s, origins(spec, self._columns), directions(spec, self._columns)
-        )
+        return shots_of(time_ns, origins(spec, self._columns), directions(spec, self._columns))
 
     def packets(self, chunk: int, distance_m: F64Array, reflectivity: F64Array) -> list[Sent]:
         """Packets of a chunk, and position packets of the same time."""
         spec = advanced(self._spec, chunk * _CHUNK_PACKETS)
         table = spec.table
-        reach_m = np.array(table.dist_m)
-        counts = whole_counts(distance_m - reach_m, table.unit_m, _LARGEST, None)
-        level = np.where(counts > 0, np.rint(reflectivity), 0.0).astype(np.int64)
-        shape = (*counts.shape, spec.returns)
-        sent = encode(
-            spec,
-            np.broadcast_to(counts[..., None], shape),
-            np.broadcast_to(level[..., None], shape),
-        )
+        past_m = distance_m - np.array(table.dist_m)
+        sent = encode(spec, *readings(past_m, reflectivity, table.unit_m, _LARGEST, spec.returns))
         first_us = (chunk * _CHUNK_PACKETS + 1 + np.arange(_CHUNK_PACKETS)) * self._packet_us
         end_ns = self._start_ns + np.rint(first_us * NS_PER_US).astype(np.int64)
         data = [
@@ -105,12 +89,6 @@ class SimulatedVelodyne:
             for at, payload in zip(end_ns.tolist(), sent.payloads, strict=True)
         ]
         return data + self._positions(chunk) if self._has_positions else data
-
-    def imu_packets(
-        self, time_ns: I64Array, acceleration: F64Array, angular_velocity: F64Array
-    ) -> list[Sent]:
-        """None: its IMU is not supported."""
-        return []
 
     def _positions(self, chunk: int) -> list[Sent]:
         """Return position packets with the time of the GPS, two per second."""
@@ -123,3 +101,6 @@ class SimulatedVelodyne:
             Sent(self._start_ns + at, POSITION_PORT, payload.tobytes())
             for at, payload in zip(after, sent.payloads, strict=True)
         ]
+
+
+simulated = SimulatedVelodyne

@@ -16,21 +16,13 @@ from hypothesis import strategies as st
 from mlbatch.errors import RecordingError
 from mlbatch.readers.formats.pcapng import Resolution
 from tests.builders.captures import (
-    ETHERNET,
-    LOOP,
-    NULL,
     OLD_PACKET,
     RAW,
     SIMPLE,
-    SLL,
-    SLL2,
     Interface,
     Other,
     Packet,
     Section,
-    ipv4_packet,
-    ipv6_packet,
-    link_frame,
     pcap_bytes,
     section_bytes,
     udp_frame,
@@ -41,15 +33,7 @@ from tests.builders.reading import Seen, open_capture, read
 
 PAYLOAD = bytes(range(256)) * 4
 T0_NS = 1_700_000_000_123_456_789
-FOUR = ("10.0.0.1", "10.0.0.2")
-SIX = ("fe80::1", "fe80::2")
 (FRAME,) = udp_frame(PAYLOAD)
-
-
-def udp(payload: bytes, *, length: int | None = None) -> bytes:
-    """A UDP header and its payload; `length` overrides the announced one."""
-    size = len(payload) + 8 if length is None else length
-    return struct.pack(">4H", 9, 7502, size, 0) + payload
 
 
 # -- stamps ---------------------------------------------------------------------------------------
@@ -170,52 +154,9 @@ def test_stamps_equal_exact_fractions(code: int, offset_s: int, ticks: list[int]
 # -- frames ---------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("mtu", [None, 576])
-@pytest.mark.parametrize(
-    ("link", "pair", "vlans"),
-    [
-        *((link, FOUR, []) for link in (ETHERNET, NULL, LOOP, RAW, 12, 14, SLL, SLL2, 228)),
-        *((link, SIX, []) for link in (ETHERNET, NULL, LOOP, RAW, SLL, SLL2, 229)),
-        *(
-            (link, FOUR, vlans)
-            for link in (ETHERNET, SLL, SLL2)
-            for vlans in ([0x8100], [0x88A8, 0x8100], [0x9100, 0x8100, 0x8100])
-        ),
-    ],
-)
-def test_every_link_type_gives_the_payload(
-    tmp_path: Path, link: int, pair: tuple[str, str], vlans: list[int], mtu: int | None
-) -> None:
-    frames = udp_frame(PAYLOAD, *pair, mtu=mtu, link=link, vlans=vlans)
-    frames += udp_frame(b"plain", *pair, link=link)
-    path = write_pcap(tmp_path / "a", [(T0_NS, frame) for frame in frames], linktype=link)
-    stream = f"{pair[0]} > port 7502"
-    assert read(open_capture(path)) == [Seen(T0_NS, stream, PAYLOAD), Seen(T0_NS, stream, b"plain")]
-
-
-# Hop-by-hop (0) of 8 bytes, then destination options (60) of 16, then UDP.
-CHAIN = bytes([60, 0, *bytes(6)]) + bytes([17, 1, *bytes(14)]) + udp(PAYLOAD)
-# A fragment that is the whole datagram.
-ATOM = struct.pack(">BBHI", 17, 0, 0, 5) + udp(PAYLOAD)
-HEADERS = {
-    "null, little endian": (NULL, struct.pack("<I", 2) + ipv4_packet(udp(PAYLOAD), *FOUR)),
-    "null, big endian": (NULL, struct.pack(">I", 2) + ipv4_packet(udp(PAYLOAD), *FOUR)),
-    "bits of the FCS": (0x5400_0001, FRAME),
-    "IPv4 options": (
-        ETHERNET,
-        link_frame(ipv4_packet(udp(PAYLOAD), *FOUR, options=bytes(40))),
-    ),
-    "IPv6 headers": (ETHERNET, link_frame(ipv6_packet(CHAIN, *SIX, next_header=0), version=6)),
-    "IPv6 fragment": (ETHERNET, link_frame(ipv6_packet(ATOM, *SIX, next_header=44), version=6)),
-    "padding after UDP": (ETHERNET, FRAME + bytes(30)),
-    "wrong IP length": (ETHERNET, link_frame(ipv4_packet(udp(PAYLOAD), *FOUR, total=1234))),
-}
-
-
-@pytest.mark.parametrize("name", HEADERS)
-def test_headers_are_skipped(tmp_path: Path, name: str) -> None:
-    link, frame = HEADERS[name]
-    path = write_pcap(tmp_path / "a", [(0, frame)], linktype=link)
+def test_bits_of_the_fcs_are_no_link_type(tmp_path: Path) -> None:
+    """Links, tags and headers: `tests/readers/capture/test_frames.py`."""
+    path = write_pcap(tmp_path / "a", [(0, FRAME)], linktype=0x5400_0001)
     assert [one.payload for one in read(open_capture(path))] == [PAYLOAD]
 
 
@@ -225,24 +166,9 @@ def test_largest_datagram_in_one_frame(tmp_path: Path) -> None:
     assert [len(one.payload) for one in read(open_capture(path, buffer_bytes=4096))] == [65507]
 
 
-ARP = bytes(12) + b"\x08\x06" + bytes(28)
-SPANNING_TREE = bytes(12) + b"\x00\x26" + bytes(38)
-TCP = link_frame(ipv4_packet(bytes(20), *FOUR, protocol=6))
-ICMP6 = link_frame(ipv6_packet(bytes(8), *SIX, next_header=58), version=6)
 CUT = Packet(FRAME[:40], original=len(FRAME))
 CUT_SIMPLE = Packet(FRAME[:30], kind=SIMPLE, original=len(FRAME))
 SKIPPED: Mapping[str, tuple[Section, dict[str, int]]] = {
-    "foreign": (
-        Section([Packet(frame) for frame in (ARP, TCP, ICMP6, SPANNING_TREE, TCP)]),
-        {"not_ip": 2, "not_udp": 3},
-    ),
-    **{
-        f"UDP length {length}": (
-            Section([Packet(link_frame(ipv4_packet(udp(b"12345", length=length), *FOUR)))]),
-            {"truncated": 1},
-        )
-        for length in (0, 7, 100)
-    },
     "snaplen": (Section([CUT]), {"truncated": 1}),
     "snaplen of simple packets": (
         Section([CUT_SIMPLE], [Interface(snaplen=len(FRAME))]),
