@@ -172,21 +172,16 @@ class InstantFinder:
         shown: int,
         spot: Spot | None,
     ) -> SharedInstant:
-        sets = [
-            InstantSet(name, tuple(_ages_ms(sweep, window.end_ns) for sweep in sweeps))
-            for name, sweeps in members.items()
-        ]
-        if points:
-            sets = [
-                InstantSet(
-                    one.name,
-                    one.ages_ms,
-                    own,
-                    None if spot is None else spot_apart_ms(own, spot),
-                    apart(own, cells(own), self._period_ns).shared_ms(),
-                )
-                for one, own in zip(sets, points, strict=True)
-            ]
+        sets = []
+        for number, (name, sweeps) in enumerate(members.items()):
+            ages_ms = tuple(_ages_ms(sweep, window.end_ns) for sweep in sweeps)
+            if not points:
+                sets.append(InstantSet(name, ages_ms))
+                continue
+            own = points[number]
+            spot_ms = None if spot is None else spot_apart_ms(own, spot)
+            apart_ms = apart(own, cells(own), self._period_ns).shared_ms()
+            sets.append(InstantSet(name, ages_ms, own, spot_ms, apart_ms))
         return SharedInstant(
             at_s=(window.end_ns - self._first_ns) / NS_PER_S,
             looked=0,

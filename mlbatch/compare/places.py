@@ -75,19 +75,21 @@ def apart(points: SetPoints, cell: I64Array, period_ns: int) -> Apart:
 
 def difference(fused: SetPoints, window: SetPoints, period_ns: int) -> Spot | None:
     """The largest difference; None where the times of lidars are as near in the fused set."""
-    one, two = (apart(points, cells(points), period_ns) for points in (fused, window))
-    both, mine, theirs = np.intersect1d(one.cell, two.cell, return_indices=True)
-    gain_ns = one.apart_ns[mine] - two.apart_ns[theirs]
-    kept = (one.lidars[mine] > 1) & (gain_ns >= _LEAST_GAIN_NS)
+    mine, theirs = cells(fused), cells(window)
+    one, two = apart(fused, mine, period_ns), apart(window, theirs, period_ns)
+    both, first, second = np.intersect1d(one.cell, two.cell, return_indices=True)
+    gain_ns = one.apart_ns[first] - two.apart_ns[second]
+    kept = (one.lidars[first] > 1) & (gain_ns >= _LEAST_GAIN_NS)
     both, gain_ns = both[kept], gain_ns[kept]
     if not len(both):
         return None
-    some, others = (points.take(np.isin(cells(points), both)) for points in (fused, window))
-    cell = np.searchsorted(both, cells(some))
+    inside = np.flatnonzero(np.isin(mine, both))
+    xyz, cell = fused.xyz[inside], np.searchsorted(both, mine[inside])
     low_m = np.full(len(both), np.inf)
-    np.minimum.at(low_m, cell, some.xyz[:, 2])
-    above = some.xyz[:, 2] > low_m[cell] + _GROUND_M
-    lone = above & _without_neighbour(some.xyz, others.xyz)
+    np.minimum.at(low_m, cell, xyz[:, 2])
+    above = xyz[:, 2] > low_m[cell] + _GROUND_M
+    lone = above.copy()
+    lone[above] = _without_neighbour(xyz[above], window.xyz[np.isin(theirs, both)])
     points, unmatched = (np.bincount(cell[rows], minlength=len(both)) for rows in (above, lone))
     moved = (unmatched >= _LEAST_UNMATCHED) & (unmatched >= _LEAST_SHARE * points)
     if moved.any():
@@ -98,7 +100,7 @@ def difference(fused: SetPoints, window: SetPoints, period_ns: int) -> Spot | No
         worst = gain_ns >= gain_ns.max() - _LEAST_GAIN_NS
         best = int(np.where(worst, np.bincount(cell, minlength=len(both)), 0).argmax())
         rows, counts = cell == best, (0, 0)
-    x, y, z = some.xyz[rows].mean(axis=0, dtype=np.float64).tolist()
+    x, y, z = xyz[rows].mean(axis=0, dtype=np.float64).tolist()
     return Spot((x, y, z), float(gain_ns[best]), *counts)
 
 

@@ -70,6 +70,9 @@ function startPlayer(data, load, last) {
   async function show(number) {
     const before = chosen;
     chosen = number;
+    const waiting = setTimeout(() => {
+      byId("cloudinfo").textContent = "Loading scan " + number + " ...";
+    }, 500);
     let cloud = null;
     try {
       cloud = await pointsOf(number);
@@ -77,6 +80,7 @@ function startPlayer(data, load, last) {
       stop();
       say(err.message);
     }
+    clearTimeout(waiting);
     if (chosen !== number) return true;
     slider.max = last();
     if (!cloud) { chosen = before; return false; }

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 from collections.abc import Iterator
 from dataclasses import replace
@@ -18,6 +19,7 @@ from mlbatch.page.comparison import binned, comparison_page, nice_step
 from mlbatch.page.instant import InstantSet, SetPoints, SharedInstant, Spot
 from mlbatch.page.policies import PolicyFigures, offset_m
 from tests.page.browser import CHROMIUM, NO_CHROMIUM, Browser, browser
+from tests.page.test_view import wait_for
 
 HOSTILE = "<script>alert(1)</script>&'\""
 
@@ -215,21 +217,21 @@ def test_both_clouds_are_shown_from_one_place(tab: Browser, tmp_path: Path) -> N
     tab.open(path)
     image = "document.querySelector('#stage canvas').toDataURL()"
     shown = "document.documentElement.dataset.shown"
-    fused = tab.run(image)
-    assert tab.run(shown) == "0"
+    wait_for(tab, shown, "0")
     assert "age 150 to 0 ms" in tab.run("document.getElementById('legend').textContent")
     tab.run("document.getElementById('cloud').focus()")
     tab.press(" ")
-    assert tab.run(shown) == "1"
+    wait_for(tab, shown, "1")
     windows = tab.run(image)
-    # Of another colour, since as old as the other lidar.
-    assert windows != fused
     tab.run("document.getElementById('play').click()")
+    wait_for(tab, shown, "0")
+    fused = tab.run(image)
+    # Of another colour, since older.
+    assert windows != fused
     tab.press("f")
-    assert tab.run(shown) == "0"
-    assert tab.run(image) != fused
+    wait_for(tab, f"{image} === {json.dumps(fused)}", False)
     tab.press("p")
-    assert tab.run(image) == fused
+    wait_for(tab, f"{image} === {json.dumps(fused)}", True)
     assert tab.errors == []
 
 
