@@ -33,7 +33,7 @@ from mlbatch.batching.windows import Policy, Schedule, Window
 from mlbatch.clocks.compare import refuse_incomparable
 from mlbatch.errors import ClockJump
 from mlbatch.types import Columns, WindowColumns, WindowFigures
-from mlbatch.units import NS_PER_MS
+from mlbatch.units import NS_PER_MS, NS_PER_S
 
 # Allowed lateness.
 SLACK_NS = 10 * NS_PER_MS
@@ -93,6 +93,10 @@ class Batcher:
         self._watermark = NEVER
         # All columns before this stamp are published.
         self._until = NEVER
+        # Partial windows with the reason to drop them, until one is whole; None: one was.
+        self._partial: list[tuple[Window, str]] | None = [] if policy.partial_if_short else None
+        # True once they were given instead of whole ones.
+        self.gave_partial = False
         self._gaps = EdgeGaps(len(self._tracks))
         paces = paces or [UNKNOWN_PACE] * len(self._tracks)
         self._fill = FillMeter(paces)
@@ -141,6 +145,7 @@ class Batcher:
             ),
             last_of_all=max(newest_ns),
         )
+        yield from self._short(min(firsts), max(newest_ns))
 
     # -- state for reports and for the packet ring ----------------------------------------------
 
@@ -204,6 +209,9 @@ class Batcher:
         track = self._tracks[sensor]
         held = track.intake.held_ring_index
         oldest = track.oldest_ring_index if held is None else min(track.oldest_ring_index, held)
+        for window, _ in self._partial or ():
+            own = window.columns.ring_index[window.columns.sensor == sensor]
+            oldest = min(oldest, int(own.min(initial=FOREVER)))
         return None if oldest == FOREVER else oldest
 
     @property
@@ -408,7 +416,8 @@ class Batcher:
             gaps_ns = self._gaps.measure(start, end, own)
             fill = self._fill.measure(end - start, own, columns)
             reason = self._schedule.enter(window, last_of_all)
-            if reason:
+            is_kept = self._partial is not None and reason in ("head", "tail")
+            if reason and not is_kept:
                 self._drop(own, reason)
                 continue
             one = Window(
@@ -424,11 +433,31 @@ class Batcher:
                 fill=fill,
                 is_partial=self._schedule.is_partial(window, last_of_all),
             )
+            if is_kept and self._partial is not None:
+                self._partial.append((one, reason))
+                continue
+            self._drop_partial()
             windows.append(one)
         for track in self._tracks:
             if track.gaps:
                 track.gaps = [gap for gap in track.gaps if gap[1] > until]
         return windows
+
+    def _short(self, first_ns: int, last_ns: int) -> list[Window]:
+        """The partial windows of an input of less than two windows, none of which is whole."""
+        partial = self._partial
+        if partial and (last_ns - first_ns) * self._grid.rate < 2 * NS_PER_S:
+            self.gave_partial = True
+            self._partial = None
+            return [window for window, _ in partial]
+        self._drop_partial()
+        return []
+
+    def _drop_partial(self) -> None:
+        """Drop the partial windows that were kept."""
+        for window, reason in self._partial or ():
+            self._drop(window.figures, reason)
+        self._partial = None
 
     def _take_until(self, until: int) -> WindowColumns:
         """Take the waiting columns before `until`, merged."""

@@ -72,6 +72,7 @@ class Policy(NamedTuple):
     start: Limit | None = None  # windows start at or after it
     end: Limit | None = None  # windows start before it
     covered: Coverage | None = None  # by the scans that are batched again
+    partial_if_short: bool = False  # also write them where no window is whole, in less than two
 
 
 @dataclass(slots=True)

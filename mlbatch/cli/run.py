@@ -5,6 +5,7 @@ Apart from `convert.py`, whose options are described without loading any of this
 
 from __future__ import annotations
 
+import shlex
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
@@ -115,6 +116,12 @@ def _print_summary(
     print_summary(inputs)
     if written := [str(path) for path in (target.written, target.map) if path is not None]:
         typer.echo(one_line(f"wrote {' and '.join(written)}, report {report_path}"))
+    if target.written is not None:
+        name = shlex.quote(str(target.written))
+        page = f"mlbatch report {name} makes the page"
+        if target.html is not None:
+            page = f"the page is {target.html}"
+        typer.echo(one_line(f"{page}, mlbatch view {name} plays the scans"))
 
 
 def _beyond_limits_before(target: Target, name: str) -> list[str]:

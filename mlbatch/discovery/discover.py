@@ -158,7 +158,7 @@ def discover(
     to_convert: raise an error for sensors that cannot be converted: none found, several at one
     address, clocks that cannot be compared. It names what is missing and how to give it.
     """
-    paths = [recording.path for recording in recordings]
+    paths = tuple(recording.path for recording in recordings)
     output = _output_of(recordings)
     rig = None if selection.rig is None else read_rig(selection.rig, paths)
     if output is not None:

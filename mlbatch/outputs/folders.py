@@ -9,7 +9,7 @@ from pathlib import Path
 
 from isal.isal_zlib import crc32
 
-from mlbatch.bounded import MOST_TABLE_BYTES, read_bytes
+from mlbatch.bounded import MOST_TABLE_BYTES, read_bytes, read_text
 from mlbatch.outputs.damage import CheckLog, DamageError, VerifyError
 from mlbatch.outputs.metadata import RunMetadata
 from mlbatch.outputs.stored_scan import StoredScan
@@ -37,6 +37,8 @@ class ScanFile:
     suffix: str
     # Sum of the CRC-32 of what was read, modulo 2^32.
     checksum: int = 0
+    # The only scan of an output, which may have any name.
+    is_only: bool = False
 
     def read(self, other: Path | None = None) -> bytes:
         """The bytes of the file, or of another one of the scan."""
@@ -53,6 +55,8 @@ class ScanFile:
         name = "head" if index < 0 else f"{index:06d}"
         if slices > 1:
             name += f"-{part}"
+        if self.is_only:
+            return
         log.equal("names", self.where, name + self.suffix, self.path.name)
 
     def sensor_index(self, log: CheckLog, sensors: tuple[str, ...]) -> int | None:
@@ -116,7 +120,12 @@ def refuse_shard(folder: Path) -> None:
 
 
 def scan_files(log: CheckLog, folder: Path, suffix: str) -> list[ScanFile]:
-    """All files of scans, sorted by sensor and time; unexpected names are violations."""
+    """All files of scans, sorted by sensor and time; unexpected names are violations.
+
+    folder: or the only scan of an output, whose index and slice are in the table next to it.
+    """
+    if folder.is_file():
+        return [_only_file(folder, suffix)]
     files = list(_files_of(log, folder, suffix, None))
     split = [
         file
@@ -131,6 +140,21 @@ def scan_files(log: CheckLog, folder: Path, suffix: str) -> list[ScanFile]:
     if len({file.slice is None for file in files}) > 1:
         log.fail("names", folder.name, "names with or without a slice", "both")
     return sorted(files, key=lambda file: (file.sensor or "", file.index, file.slice or 0))
+
+
+def _only_file(path: Path, suffix: str) -> ScanFile:
+    from mlbatch.outputs.table import read_table
+
+    try:
+        table = read_text(path.with_name(f"{path.name}.scans.csv"), MOST_TABLE_BYTES)
+        row = read_table(table, f"{path}: scans.csv")[0]
+        number, part = int(row["index"]), int(row["slice"])
+    except (OSError, ValueError, LookupError) as err:
+        raise VerifyError(
+            f"{path}: expected scans.csv next to the only scan of an output, found none that can "
+            "be read; put it back, or convert again"
+        ) from err
+    return ScanFile(path, path.name, None, number, part, suffix, is_only=True)
 
 
 def _files_of(log: CheckLog, folder: Path, suffix: str, sensor: str | None) -> Iterator[ScanFile]:

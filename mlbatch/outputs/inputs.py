@@ -44,7 +44,9 @@ def open_inputs(paths: Sequence[Path], streams: StreamTable, rig: Path | None) -
 
 def _is_output(path: Path) -> bool:
     """Whether a path is an output of `convert`; folders of files have a report."""
-    if not path.is_dir() and not (path.is_file() and read_head(path).startswith(_HEADS)):
+    has_report = path.with_name(f"{path.name}.report.json").is_file()
+    is_likely = has_report or (path.is_file() and read_head(path).startswith(_HEADS))
+    if not path.is_dir() and not is_likely:
         return False
     # Not loaded for captures.
     from mlbatch.outputs.run_files import RunFiles, is_output
@@ -58,4 +60,4 @@ def _is_of_files(path: Path) -> bool:
     """Whether an output has a file for each scan."""
     from mlbatch.outputs.kinds import kind_of
 
-    return path.is_dir() and kind_of(path).form is not None
+    return path.exists() and kind_of(path).form is not None

@@ -18,6 +18,7 @@ from mlbatch.outputs.damage import CheckLog, VerifyError
 from mlbatch.outputs.folders import ScanReader, entries, refuse_shard
 
 METADATA = "metadata.yaml"
+REPORT = "report.json"
 _MAGICS = {b"\x89MCAP0\r\n": "mcap", b"#ROSBAG V2.0\n": "rosbag1"}
 _HEAD_BYTES = 16
 
@@ -82,6 +83,10 @@ def kind_of(path: Path) -> Kind:
     for magic, name in _MAGICS.items():
         if head.startswith(magic):
             return Kind(name)
+    form = format_of([path])
+    if form is not None and path.with_name(f"{path.name}.{REPORT}").is_file():
+        # The only scan of an output.
+        return Kind("files", form)
     return Kind("", found="a file of another kind" if head else "an empty file")
 
 

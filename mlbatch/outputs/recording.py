@@ -68,7 +68,7 @@ class OutputRecording(WrappedRecording):
             super().__init__(open_recording(path, streams))
             self._messages: MessageScans | None = MessageScans.of_output(path)
         else:
-            files = [one for one in path.rglob("*") if one.is_file()]
+            files = [one for one in (path, *path.rglob("*")) if one.is_file()]
             self._files = len(files)
             size_bytes = sum(one.stat().st_size for one in files)
             super().__init__(Recording(path, kind.form.name, size_bytes))

@@ -10,12 +10,11 @@ from typing import TYPE_CHECKING
 from mlbatch.bounded import MOST_TABLE_BYTES, open_file, read_text
 from mlbatch.outputs.damage import CheckLog, VerifyError
 from mlbatch.outputs.folders import entries
-from mlbatch.outputs.kinds import format_of, kind_of
+from mlbatch.outputs.kinds import REPORT, format_of, kind_of
 
 if TYPE_CHECKING:
     from mlbatch.outputs.mcap_file import McapFile
 
-REPORT = "report.json"
 TABLE = "scans.csv"
 # In mlbatch.grid of each of several files; their report and table are in the folder.
 PIECES = "windows_per_file"

@@ -23,6 +23,7 @@ REMEDIES = {
     "cut_off": "copy the file again, or record with tcpdump -U; scans end where the file does",
     "recording": "copy the file again; the readable part was used",
     "message": "give metadata with --metadata, transforms in a rig file (--rig)",
+    "short": "record two periods or more; or choose a higher --rate",
     "late_stream": "name the sensor in a rig file (--rig)",
     "no_metadata": "give the sensor's metadata or calibration with --metadata FILE",
     "no_decoder": "see mlbatch sensors for the supported models",

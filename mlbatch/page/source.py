@@ -8,7 +8,8 @@ from pathlib import Path
 from mlbatch.bounded import open_file
 from mlbatch.errors import ExportError, RecordingError
 from mlbatch.outputs.folders import refuse_shard
-from mlbatch.outputs.run_files import REPORT, RunFiles
+from mlbatch.outputs.kinds import REPORT
+from mlbatch.outputs.run_files import RunFiles
 from mlbatch.report.report import RunReport, report_of
 
 _REPORT_SUFFIX = f".{REPORT}"

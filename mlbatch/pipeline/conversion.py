@@ -21,7 +21,7 @@ from mlbatch.discovery.types import OUTPUT, Note
 from mlbatch.errors import NoScanError, PacketError, UsageError
 from mlbatch.pipeline import run_report
 from mlbatch.pipeline.decode_pool import DecodePool, DecodeTask
-from mlbatch.pipeline.job import DEFAULT_RATE, Job
+from mlbatch.pipeline.job import DEFAULT_RATE, Job, TimeSegment
 from mlbatch.pipeline.passthrough import Passthrough
 from mlbatch.pipeline.sensor import Sensor
 from mlbatch.pipeline.session import Session
@@ -148,6 +148,8 @@ class Conversion:
                 job.start,
                 job.end,
                 None if output is None else output.coverage,
+                # Of a part of a session, other parts may have whole windows.
+                job.shard is None and job.segment == TimeSegment(),
             ),
             paces,
             merge,
@@ -271,7 +273,17 @@ class Conversion:
                 self.session.keep_from(self._oldest_ring_indexes())
         self.session.refuse_apart()
         # Step 5: end of input; no sensor is waited for.
-        yield from self.batcher.finish(self.session.last_host_ns)
+        is_short = False
+        for window in self.batcher.finish(self.session.last_host_ns):
+            if self.batcher.gave_partial and not is_short:
+                is_short = True
+                text = (
+                    f"no whole window of {float(NS_PER_S / self.grid.rate / NS_PER_MS):g} ms, "
+                    "since the recording is shorter than two: its partial windows are written, as "
+                    "by --keep-partial"
+                )
+                self.warn(Note("short", "", text))
+            yield window
 
     def _awaits_poses(self) -> bool:
         """Whether windows before `--end` need poses that are recorded after it."""

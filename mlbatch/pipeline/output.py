@@ -18,6 +18,7 @@ from mlbatch.types import RunInfo
 from mlbatch.writers import (
     FILES_JSONL,
     REPORT_JSON,
+    SCANS_CSV,
     SHARD_JSON,
     FilesWriter,
     ScanWriter,
@@ -26,9 +27,11 @@ from mlbatch.writers import (
     check_target,
     check_variants,
     choose_format,
+    discard,
     export_errors,
     extras,
     jobs_for,
+    one_file_format,
     open_writer,
     partial_path,
     record_layout,
@@ -81,9 +84,12 @@ class Output:
     """
 
     def __init__(self, job: Job, request: OutputRequest, say: Listener, warn: Listener) -> None:
+        request, only = _one_file(job, request)
         self.format = choose_format(request.output, request.format)
         self.files: Files | None = None
         self.report_path = request.report
+        if only is not None and request.report is None and not request.dry_run:
+            self.report_path = side_path(only, REPORT_JSON)
         self.is_complete = False
         self._map: MapWriter | None = None
         self._request = request
@@ -96,6 +102,7 @@ class Output:
             ply_style=request.ply_style,
             fsync=request.fsync,
             max_bag_s=job.max_bag_s,
+            only=only,
         )
         check_options(self.format, options)
         check_variants(self.format, job.variants)
@@ -166,7 +173,17 @@ class Output:
                 write_text(self.report_path, report_text(report))
             return run, report
         open_scans = None if path is None else partial(self._open, path)
-        run, report = convert(self.job, open_scans, progress, self.files, self._finish, self._map)
+        only = self._options.only
+        try:
+            run, report = convert(
+                self.job, open_scans, progress, self.files, self._finish, self._map
+            )
+        except BaseException:
+            if path is not None and only is not None:
+                discard(path)
+            raise
+        if path is not None and only is not None:
+            _take_out(path, only)
         return run, self._completed(report)
 
     def _completed(self, report: RunReport) -> RunReport:
@@ -260,6 +277,29 @@ class Output:
             return ""
         shard = {} if job.shard is None else {"shard": str(job.shard)}
         return difference_of_outputs(identity, identity_of(job, self.format, self._options) | shard)
+
+
+def _one_file(job: Job, request: OutputRequest) -> tuple[OutputRequest, Path | None]:
+    """The request for a folder with one scan, and the file that becomes of it; None for others."""
+    only = request.output
+    name = "" if only is None else one_file_format(only, request.format)
+    if only is None or not name or job.split or job.shard is not None or request.resume:
+        return request, None
+    if only.exists() and not (request.overwrite and only.is_file()):
+        raise ExportError(
+            f"{only}: expected a new output, found an existing one; choose another or --overwrite"
+        )
+    folder = only.with_name(f"{only.name}.d")
+    return request._replace(output=folder, format=name), only
+
+
+def _take_out(folder: Path, only: Path) -> None:
+    """Move the only scan and the table out of their folder, and remove that."""
+    with export_errors(only):
+        (folder / SCANS_CSV).replace(side_path(only, SCANS_CSV))
+        (scan,) = folder.glob(f"*{only.suffix.lower()}")
+        scan.replace(only)
+        folder.rmdir()
 
 
 def _remove_state(path: Path, say: Listener) -> None:

@@ -8,6 +8,8 @@ from pathlib import Path
 
 from mlbatch.errors import RecordingError
 from mlbatch.readers import FolderReader, readers
+from mlbatch.readers.bag.folder import has_bag
+from mlbatch.readers.datasets import BAG_METADATA
 from mlbatch.readers.source import read_head
 
 _PARTIAL = ".partial"
@@ -16,7 +18,8 @@ _PARTIAL = ".partial"
 def expand(paths: Iterable[Path]) -> tuple[Path, ...]:
     """Files and bags for the paths given, each once, in their order; patterns and folders by name.
 
-    A folder with captures or ROS 1 bags stands for all of them; one of a ROS 2 bag for itself.
+    A folder with captures or ROS 1 bags stands for all of them, one with a file or folder of a ROS
+    2 bag for that, and a ROS 2 bag for itself.
     """
     return tuple(dict.fromkeys(found for path in paths for found in _expanded(path)))
 
@@ -59,7 +62,12 @@ def _of_folder(folder: Path) -> Iterator[Path]:
             f"{folder}: expected one bag, or captures, found parts of a bag ({parts[0].name}) and "
             f"other recordings ({alone[0].name}); name the files"
         )
-    yield from alone or [folder]
+    if len(parts) == 1 and not (folder / BAG_METADATA).exists():
+        # Calibrations are next to it.
+        yield parts[0]
+        return
+    bags = [] if parts or alone else [path for path in folder.iterdir() if has_bag(path)]
+    yield from alone or (bags if len(bags) == 1 else [folder])
 
 
 def _may_be_recording(path: Path) -> bool:

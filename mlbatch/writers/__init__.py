@@ -80,6 +80,7 @@ __all__ = [
     "jobs_for",
     "locked",
     "old_path",
+    "one_file_format",
     "open_writer",
     "parse_jobs",
     "partial_path",
@@ -95,6 +96,8 @@ __all__ = [
 ]
 
 DEFAULT_FORMAT = "npz"
+# Formats of which a scan may be an output of its own.
+ONE_FILE = ("npz", "ply", "pcd", "las", "laz")
 # Formats without a header.
 ROWS = ("kitti", "nuscenes")
 
@@ -132,6 +135,12 @@ def choose_format(target: Path | None, asked: str | None) -> str:
             f"{asked}, found that of a {found} file; change {suffix} or leave out the option"
         )
     return plugin(asked).FORMAT
+
+
+def one_file_format(target: Path, asked: str | None) -> str:
+    """Return the format of an output that is the file of one scan, as `scan.ply`; "" of others."""
+    name = target.suffix.lower().removeprefix(".")
+    return name if name in ONE_FILE and asked in (None, name) else ""
 
 
 def _format_of_suffix(suffix: str) -> str | None:

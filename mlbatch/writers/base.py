@@ -28,6 +28,7 @@ class WriterOptions(NamedTuple):
     fsync: bool = True  # force the output to the disk before it gets its name
     max_bag_s: float = 0.0  # recorded time in a file of a ROS 2 bag, s; 0: all in one file
     files: FileSet | None = None  # the files that this run is to make; None: all
+    only: Path | None = None  # the file that the only scan of a folder becomes; None: any number
 
 
 class FileSet(Protocol):

@@ -109,12 +109,21 @@ class FolderWriter(FilesWriter):
         self._entries: dict[int | None, list[Entry]] = {}
         self._files = options.files
         self._behind = WriteBehind()
+        self._only = options.only
+        self._has_scan = False
         self._folders: dict[int | None, Path] = {None: self._output.partial}
         if options.split:
             self._folders |= self._sensor_folders(info)
 
     def write(self, scan: Scan, sensor: int | None = None) -> ScanJob:
         """Return the job that writes a scan to a file of its own."""
+        if self._only is not None and self._has_scan:
+            folder, name = self._only.with_suffix(""), next(iter(self._encoders))
+            raise UsageError(
+                f"-o {self._only}: expected one scan for one file, found more; select one with "
+                f"--start and --end, or give -o {folder} --format {name} for a file of each"
+            )
+        self._has_scan = True
         return _SaveJob(self, scan, sensor, self._paths(scan, sensor))
 
     def skip(self, scan: Scan, sensor: int | None = None) -> ScanJob:

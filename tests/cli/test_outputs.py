@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import mlbatch
 from tests.builders.mcaps import write_mcap
 from tests.builders.run import command
 from tests.builders.sessions import (
@@ -200,3 +201,40 @@ def test_a_terminal_obeys_no_topic(shell: Shell, tmp_path: Path) -> None:
     assert outcome.code == 0, outcome.err
     assert outcome.out.startswith("ouster_111: ")
     assert r"calibration /a\x1b[31m\x07\n/ouster/metadata" in outcome.out
+
+
+@pytest.mark.parametrize("suffix", ["ply", "npz", "pcd", "las"])
+def test_the_only_scan_is_a_file(shell: Shell, place: Path, tmp_path: Path, suffix: str) -> None:
+    one = tmp_path / f"one.{suffix}"
+    line = f"convert {FIX} --start +0.2 --end +0.3 -o {one}"
+    done = shell(line)
+    assert done.code == 0
+    assert done.out.splitlines()[-1].endswith(f"mlbatch view {one} plays the scans")
+    files = {f"{one.name}{end}" for end in ("", ".report.json", ".scans.csv")}
+    assert {path.name for path in tmp_path.iterdir()} == files
+    (scan,) = mlbatch.read(one)
+    third = list(mlbatch.read(place / "whole"))[2]
+    assert (scan.index, scan.start_ns, scan.point_count) == (2, third.start_ns, third.point_count)
+    # LAS stores whole tenths of a millimetre.
+    np.testing.assert_allclose(scan.xyz, third.xyz, rtol=0, atol=0.51e-4)
+    assert mlbatch.verify(one).ok
+    assert (shell(line).code, shell(f"{line} --overwrite -q").out) == (1, "")
+    again = mlbatch.convert(one, tmp_path / "again.mcap")
+    assert again.report.scans.points == third.point_count
+
+
+@pytest.mark.parametrize(("turns", "first_ns", "scans"), [(1, 20, 2), (1, 0, 1), (2, 20, 1)])
+def test_short_recordings_give_partial_scans(
+    shell: Shell, tmp_path: Path, turns: int, first_ns: int, scans: int
+) -> None:
+    """Of one revolution of 100 ms, in two windows or in one, all; of two with a whole window it."""
+    unit = Unit(turns=turns, begin_ns=EPOCH_NS + first_ns * NS_PER_MS)
+    drive = write_session(tmp_path / "in", unit)
+    done = shell(f"convert {drive} -o {tmp_path / 'out'} -q")
+    assert done.code == 0
+    assert ("warning: short: no whole window of 100 ms" in done.err) == (turns == 1)
+    found = list(mlbatch.read(tmp_path / "out"))
+    assert len(found) == scans
+    assert [one.complete for one in found] == [turns == 2] * scans
+    # 512 columns of 16 beams per revolution.
+    assert sum(one.point_count for one in found) == 512 * 16

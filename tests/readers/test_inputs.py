@@ -58,6 +58,7 @@ def test_what_is_missing_is_left_to_the_reader(tmp_path: Path) -> None:
 
 def test_a_bag_is_one_recording(tmp_path: Path) -> None:
     write_mcap(tmp_path / "bag_0.mcap", unit_messages(Unit(turns=1), "top"))
+    shutil.copy(tmp_path / "bag_0.mcap", tmp_path / "bag_1.mcap")
     assert expand([tmp_path]) == (tmp_path,)
 
 
@@ -86,3 +87,16 @@ def test_commands_take_them(shell: Shell, drive: Path, tmp_path: Path, name: str
         outcome = shell(command, tmp_path / name, "--json")
         assert outcome.code == 0, outcome.err
         assert "ouster_222" in outcome.out
+
+
+def test_the_folder_above_a_bag_stands_for_it(tmp_path: Path) -> None:
+    bag = tmp_path / "drive" / "bag"
+    bag.mkdir(parents=True)
+    write_mcap(bag / "bag_0.mcap", unit_messages(Unit(turns=1), "top"))
+    (bag / "metadata.yaml").touch()
+    assert expand([tmp_path / "drive"]) == (bag,)
+    # A file alone: calibrations are next to it.
+    (bag / "metadata.yaml").unlink()
+    assert expand([bag]) == (bag / "bag_0.mcap",)
+    shutil.copytree(bag, tmp_path / "drive" / "other")
+    assert expand([tmp_path / "drive"]) == (tmp_path / "drive",)

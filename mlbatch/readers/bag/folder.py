@@ -38,7 +38,7 @@ def bag_folder(folder: Path) -> BagFolder:
             "check its access rights"
         ) from err
     if not files:
-        bags = [path.name for path in inside if path.is_dir() and _has_bag(path)]
+        bags = [path.name for path in inside if has_bag(path)]
         if bags:
             raise RecordingError(
                 f"{folder}: expected a recording, found a folder with folders of bags "
@@ -59,9 +59,10 @@ def bag_folder(folder: Path) -> BagFolder:
     return BagFolder(tuple(filled), (*notes, *_stale(folder / BAG_METADATA, names, filled)))
 
 
-def _has_bag(folder: Path) -> bool:
+def has_bag(path: Path) -> bool:
+    """Whether a path is a folder with files of a bag."""
     try:
-        return any(_BAG_FILE.search(path.name) for path in folder.iterdir())
+        return path.is_dir() and any(_BAG_FILE.search(file.name) for file in path.iterdir())
     except OSError:
         return False
 
