@@ -8,7 +8,6 @@ from pathlib import Path
 
 from mlbatch.errors import RecordingError
 from mlbatch.readers import FolderReader, readers
-from mlbatch.readers.bag.folder import has_bag
 from mlbatch.readers.datasets import BAG_METADATA
 from mlbatch.readers.source import read_head
 
@@ -42,6 +41,9 @@ def _expanded(path: Path) -> Iterator[Path]:
 
 def _of_folder(folder: Path) -> Iterator[Path]:
     """The recordings in a folder, or the folder where it is a bag or has none."""
+    # Not loaded for files.
+    from mlbatch.readers.bag.folder import has_bag
+
     try:
         files = sorted(path for path in folder.iterdir() if _may_be_recording(path))
     except OSError as err:
