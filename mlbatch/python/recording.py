@@ -6,11 +6,13 @@ Everything is read when it is asked for. Each iterator is a pass of its own over
 from __future__ import annotations
 
 import contextlib
+import os
+import sys
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from operator import index as whole_number
 from pathlib import Path
-from typing import TYPE_CHECKING, SupportsIndex
+from typing import TYPE_CHECKING, SupportsIndex, overload
 
 import numpy as np
 
@@ -24,9 +26,9 @@ from mlbatch.native import require_library
 from mlbatch.outputs.inputs import open_inputs
 from mlbatch.outputs.scan import Scan
 from mlbatch.outputs.table import Rows, read_table
-from mlbatch.pipeline.conversion import Conversion
+from mlbatch.pipeline.conversion import Conversion, SkippedWindow
 from mlbatch.pipeline.ingest import Ingest
-from mlbatch.pipeline.job import DEFAULT_RATE, MOST_S, Job
+from mlbatch.pipeline.job import DEFAULT_RATE, Job
 from mlbatch.pipeline.session import Session
 from mlbatch.pipeline.time_limits import time_limit
 from mlbatch.python.options import (
@@ -87,6 +89,8 @@ class Recording:
         """
         self.job = job
         self._duration_s: float | None = None
+        self._scans: int | None = None
+        self._pass: _Pass | None = None
         found = self._discover()
         self.frame_id = found.frame_id
         rig_rate = None if found.rig is None else found.rig.rate
@@ -183,24 +187,51 @@ class Recording:
         """All scans, at the rate of the rig, else at 10 Hz."""
         return self.scans()
 
-    def __getitem__(self, index: SupportsIndex) -> Scan:
-        """The scan with this index; the recording is read up to it.
+    def __len__(self) -> int:
+        """Number of scans; the recording is read once, and nothing is decoded."""
+        if self._scans is None:
+            whole = _Pass(self.job)
+            whole.scan(sys.maxsize)
+            self._scans = whole.next
+        return self._scans
 
-        IndexError for a negative index, and for a window without a scan.
+    def __bool__(self) -> bool:
+        """True, without reading the recording."""
+        return True
+
+    @overload
+    def __getitem__(self, index: SupportsIndex) -> Scan: ...
+
+    @overload
+    def __getitem__(self, index: slice) -> list[Scan]: ...
+
+    def __getitem__(self, index: SupportsIndex | slice) -> Scan | list[Scan]:
+        """A scan by its number in `scans()`, or those of a slice.
+
+        Higher numbers than the last continue where that was read; for others the recording is read
+        from its start. Negative numbers and slices need `len`. IndexError without such a scan.
         """
+        if isinstance(index, slice):
+            numbers = range(len(self))[index]
+            found = {number: self[number] for number in sorted(numbers)}
+            return [found[number] for number in numbers]
         number = whole_number(index)
-        if number < 0:
-            raise IndexError(f"scan {number}: expected 0 or more")
-        if number * self._rate.denominator > MOST_S * self._rate.numerator:
-            raise IndexError(f"scan {number}: no such scan in {self!r}")
-        # Bounds are rounded up: the start after t_init is one of two whole nanoseconds.
-        exact = number * NS_PER_S * self._rate.denominator
-        first = Limit(exact // self._rate.numerator, from_t_init=True)
-        end = Limit(-(-exact // self._rate.numerator) + 1, from_t_init=True)
-        found = _last_of(replace(self.job, start=first, end=end))
-        if found is None or found.index != number:
-            raise IndexError(f"scan {number}: no such scan in {self!r}")
-        return found
+        number = number if number >= 0 else number + len(self)
+        scan = self._scan(number) if number >= 0 else None
+        if scan is None:
+            raise IndexError(f"scan {whole_number(index)}: no such scan in {self!r}")
+        return scan
+
+    def _scan(self, number: int) -> Scan | None:
+        # File positions are shared with a forked process.
+        current = self._pass
+        if current is None or number < current.next or current.process != os.getpid():
+            current = self._pass = _Pass(self.job)
+        return current.scan(number)
+
+    def __getstate__(self) -> dict[str, object]:
+        """All but the open files."""
+        return {**self.__dict__, "_pass": None}
 
     def at(self, moment: Moment, rate: Rate | None = None) -> Scan:
         """The scan whose window contains a time; the recording is read up to it.
@@ -295,6 +326,27 @@ class Recording:
         """The job, for what needs no extrinsics."""
         selection = replace(self.job.selection, identity_extrinsics=True)
         return replace(self.job, selection=selection)
+
+
+class _Pass:
+    """A pass over the scans of a job, of which some are decoded; next: number of the next scan."""
+
+    def __init__(self, job: Job) -> None:
+        self.process = os.getpid()
+        self.next = 0
+        self._run = Conversion(replace(job, checks_poses=False))
+        self._tasks = self._run.tasks()
+
+    def scan(self, number: int) -> Scan | None:
+        """The scan with a number from `next` on; None after the last."""
+        for task in self._tasks:
+            if isinstance(task, SkippedWindow):
+                continue
+            self.next += 1
+            if self.next > number:
+                return Scan.copied(self._run.pool.workers[0].decode(task).scan)
+            task.is_decoded = True
+        return None
 
 
 def scans_of(job: Job, warn: Callable[[Note], None] | None = None) -> Iterator[Scan]:

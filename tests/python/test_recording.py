@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import gzip
 import math
-from itertools import islice
+import multiprocessing
+import pickle
+from itertools import islice, pairwise
 from pathlib import Path
 from typing import Any
 
@@ -17,10 +20,12 @@ from mlbatch.python.recording import Recording
 from tests.builders.run import command
 from tests.builders.sessions import Unit, twin, write_session
 from tests.contract.tree import ROOT, run_python
+from tests.python.test_dataset import assert_equal
 
 FIXTURE = ROOT / "fixtures" / "two_lidars"
 CAPTURE = FIXTURE / "two_lidars.pcap"
 RIG = FIXTURE / "rig.yaml"
+FOUR_RIG = ROOT / "fixtures/four_makers/rig.yaml"
 FIRST_NS = 1_777_881_600_100_000_000  # 2026-05-04T08:00:00.1Z, by SOURCE.md of the fixture
 PERIOD_NS = 100_000_000
 
@@ -187,11 +192,66 @@ def test_times_that_are_none(start: int, rec: Recording) -> None:
         next(rec.scans(start=start))
 
 
-def test_a_scan_by_its_index(rec: Recording) -> None:
+def _without_middle(capture: Path) -> Path:
+    """The capture without the packets of 0.35 s, so that windows have no column."""
+    path = capture.with_name("gap.pcap")
+    with CAPTURE.open("rb") as source, path.open("wb") as target:
+        writer = dpkt.pcap.Writer(target, nano=True)
+        begin_s = None
+        for at_s, frame in dpkt.pcap.Reader(source):
+            begin_s = begin_s or at_s
+            if not 0.25 < at_s - begin_s < 0.6:
+                writer.writepkt(frame, at_s)
+    return path
+
+
+def _opened(case: str, folder: Path) -> Recording:
+    """A recording of a kind."""
+    if case == "four_makers.pcap":
+        return mlbatch.open(ROOT / "fixtures/four_makers" / case, rig=FOUR_RIG)
+    if case == "moving.mcap":
+        moving = ROOT / "fixtures/moving"
+        return mlbatch.open(moving / case, rig=moving / "moving.rig.yaml")
+    path = folder / case
+    if case == "gap.pcap":
+        _without_middle(path)
+    elif case == "two_lidars.pcap.gz":
+        path.write_bytes(gzip.compress(CAPTURE.read_bytes(), 1))
+    else:
+        mlbatch.extract(CAPTURE, path, rig=RIG)
+        return mlbatch.open(path, rig=path.with_suffix(".rig.yaml"))
+    return mlbatch.open(path, rig=RIG)
+
+
+@pytest.mark.parametrize(
+    "case",
+    ["two_lidars.pcap.gz", "moving.mcap", "x.db3", "x.bag", "four_makers.pcap", "gap.pcap"],
+)
+def test_scans_by_number_are_those_in_order(case: str, tmp_path: Path) -> None:
+    rec = _opened(case, tmp_path)
     whole = list(rec.scans())
-    for index in (0, 3, np.int64(6)):
-        np.testing.assert_array_equal(rec[index].xyz, whole[index].xyz)
-        assert rec[index].index == index
+    order = [0, 2, 3, len(whole) - 1, 1, 1, -1, -len(whole)]
+    for number in order:
+        assert_equal(rec[np.int64(number)], whole[number])
+    assert len(rec) == len(whole) >= 4
+    for part in (slice(1, 4, 2), slice(None, None, -2), slice(9, 3)):
+        found = rec[part]
+        assert [scan.index for scan in found] == [scan.index for scan in whole[part]]
+        for one, other in zip(found, whole[part], strict=True):
+            assert_equal(one, other)
+    gaps = [later.index - earlier.index for earlier, later in pairwise(whole)]
+    assert (max(gaps) > 1) == (case == "gap.pcap")
+
+
+def test_other_processes_read_a_recording_on_their_own(rec: Recording) -> None:
+    """File positions would be shared with a forked process."""
+    assert rec[1].index == 1
+    with multiprocessing.get_context("fork").Pool(2) as pool:
+        found = pool.map(rec.__getitem__, [2, 3, 5], chunksize=1)
+    assert rec[4].index == 4
+    assert_equal(pickle.loads(pickle.dumps(rec))[5], found[-1])
+    for scan, expected in zip(found, (2, 3, 5), strict=True):
+        assert_equal(scan, rec[expected])
 
 
 @pytest.mark.parametrize("rate", ["15", "10/3", "29.97"])
@@ -207,7 +267,7 @@ def test_a_scan_by_its_index_where_bounds_are_rounded(rate: str, tmp_path: Path)
         assert rec.at(scan.end_ns - 1).index == scan.index
 
 
-@pytest.mark.parametrize("index", [-1, 7, 1000])
+@pytest.mark.parametrize("index", [-8, 7, 1000])
 def test_an_index_without_a_scan(index: int, rec: Recording) -> None:
     with pytest.raises(IndexError, match=f"scan {index}: "):
         rec[index]
