@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+import sys
+from types import ModuleType
+from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from mlbatch.api import calibrate as calibrate
+    from mlbatch.api import compare as compare
     from mlbatch.api import convert as convert
     from mlbatch.api import dataset as dataset
     from mlbatch.api import extract as extract
     from mlbatch.api import inspect as inspect
     from mlbatch.api import open as open
     from mlbatch.api import read as read
+    from mlbatch.api import report as report
     from mlbatch.api import scans as scans
     from mlbatch.digests import digest as digest
     from mlbatch.errors import MlbatchError as MlbatchError
@@ -31,6 +35,7 @@ __all__ = [
     "Run",
     "Scan",
     "calibrate",
+    "compare",
     "convert",
     "dataset",
     "digest",
@@ -38,6 +43,7 @@ __all__ = [
     "inspect",
     "open",
     "read",
+    "report",
     "scans",
     "verify",
 ]
@@ -51,11 +57,23 @@ _PLACES = {
     "Scan": "mlbatch.outputs.scan",
     "digest": "mlbatch.digests",
     "verify": "mlbatch.verification",
-    **dict.fromkeys(
-        ("calibrate", "convert", "dataset", "extract", "inspect", "open", "read", "scans"),
-        "mlbatch.api",
-    ),
 }
+_OF_API = ("calibrate", "compare", "convert", "dataset", "extract", "inspect", "open", "read")
+_PLACES |= dict.fromkeys((*_OF_API, "report", "scans"), "mlbatch.api")
+
+
+class _Function(ModuleType):
+    """A package that has the name of a function of `mlbatch.api`, which a call of it calls."""
+
+    def __call__(self, *args: Any, **kwargs: Any) -> Any:
+        from mlbatch import api
+
+        return getattr(api, self.__name__.rpartition(".")[2])(*args, **kwargs)
+
+
+def make_callable(package: str) -> None:
+    """Let `mlbatch.report(...)` call a function although `mlbatch.report` is a package."""
+    sys.modules[package].__class__ = _Function
 
 
 def __getattr__(name: str) -> object:

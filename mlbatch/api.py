@@ -2,16 +2,23 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
+from dataclasses import replace
 from datetime import date
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from mlbatch.compare.compare import Comparison, Settings
+from mlbatch.compare.compare import compare as compare_policies
+from mlbatch.compare.figures import check_figures, write_figures
 from mlbatch.errors import UsageError
 from mlbatch.outputs.read import read as read_output
 from mlbatch.outputs.scan import Scan
-from mlbatch.page import check_page, write_text_page
+from mlbatch.page import check_page, find_source, shown_scans, write_page, write_text_page
 from mlbatch.page.calibration import calibration_page
+from mlbatch.page.comparison import comparison_page
+from mlbatch.page.policies import DEFAULT_MPS
 from mlbatch.pipeline.conversion import Progress
 from mlbatch.pipeline.extract import Extracted
 from mlbatch.pipeline.extract import extract as extract_packets
@@ -26,20 +33,26 @@ from mlbatch.python.extract import ExtractOptions, extraction
 from mlbatch.python.options import (
     AnyPath,
     ConvertOptions,
+    Document,
+    Documents,
     Moment,
     Names,
     Paths,
+    Rate,
     ScanOptions,
     SessionOptions,
     check_names,
     documented,
+    metadata_paths,
     path_of,
     paths_of,
+    rig_path,
     session_job,
     window_job,
 )
 from mlbatch.python.recording import Recording, scans_of
 from mlbatch.python.run import Run, run_job
+from mlbatch.units import NS_PER_S
 from mlbatch.writers import write_text
 
 if TYPE_CHECKING:
@@ -114,6 +127,68 @@ def read(output: AnyPath) -> Iterator[Scan]:
     return read_output(path)
 
 
+def report(
+    source: AnyPath,
+    output: AnyPath | None = None,
+    *,
+    report: AnyPath | None = None,
+    html_scans: int | str | None = None,
+    overwrite: bool = False,
+) -> Path:
+    """Write a page (HTML) of a run, as `mlbatch report` does, and return its path.
+
+    source: an output, or a report; html_scans: number of scans, or "all".
+    """
+    (path,) = paths_of("source", source)
+    found = find_source(path, path_of("report", report))
+    shown = shown_scans(None if html_scans is None else str(html_scans), "html_scans")
+    page = path_of("output", output) or found.page
+    check_page(page, overwrite=overwrite)
+    write_page(page, replace(found, scans=shown))
+    return page
+
+
+def compare(
+    recordings: Paths,
+    rig: Document | None = None,
+    *,
+    rate: Rate | None = None,
+    metadata: Documents = (),
+    clock: str = "sensor",
+    tolerance: float = 0.05,
+    timeout: float = 0.1,
+    html: AnyPath | None = None,
+    figures: AnyPath | None = None,
+    speed: float = DEFAULT_MPS,
+    overwrite: bool = False,
+) -> Comparison:
+    """Compare frame-level fusion with windows, as `mlbatch compare` does; write page and figures.
+
+    tolerance, timeout: s; speed: of an object on the page, m/s.
+    """
+    session = session_job(recordings, {"rig": rig, "metadata": metadata, "clock": clock})
+    job = window_job(session, {"rate": rate})
+    for name, value in (("tolerance", tolerance), ("timeout", timeout), ("speed", speed)):
+        if not 0 < value < math.inf:
+            raise UsageError(f"{name}: expected a number above 0, found {value}; write 0.05")
+    page, folder = path_of("html", html), path_of("figures", figures)
+    if page is not None:
+        check_page(page, overwrite=overwrite)
+    if folder is not None:
+        check_figures(folder, overwrite=overwrite)
+    settings = Settings(round(tolerance * NS_PER_S), round(timeout * NS_PER_S))
+    found = compare_policies(job, settings, finds_instant=page is not None)
+    policies = found.figures()
+    if folder is not None:
+        write_figures(folder, policies)
+    if page is not None:
+        names = ", ".join(path.name for path in job.recordings)
+        notes = [f"{note.code}: {note.message}" for note in found.notes]
+        words = (names, found.title(), policies, notes, "mlbatch.compare")
+        write_text_page(page, comparison_page(*words, found.instant, speed))
+    return found
+
+
 def dataset(*outputs: Paths) -> Dataset:
     """Open finished outputs of `convert` for random access, as for training.
 
@@ -123,20 +198,20 @@ def dataset(*outputs: Paths) -> Dataset:
     return dataset_of(path for one in outputs for path in paths_of("output", one))
 
 
-def inspect(recordings: Paths, metadata: Paths = (), *, whole: bool = False) -> Inspection:
+def inspect(recordings: Paths, metadata: Documents = (), *, whole: bool = False) -> Inspection:
     """Inspect the first 10 s of recordings (whole: all of them), as `mlbatch inspect` does."""
     paths = paths_of("recording", recordings)
     if not paths:
         raise UsageError("recording: expected at least one path, found none; name a recording")
-    return inspect_recordings(paths, paths_of("metadata", metadata), whole=whole)
+    return inspect_recordings(paths, metadata_paths(metadata), whole=whole)
 
 
 def calibrate(
     recordings: Paths,
-    rig: AnyPath,
+    rig: Document,
     output: AnyPath | None = None,
     *,
-    metadata: Paths = (),
+    metadata: Documents = (),
     only: Names = (),
     clock: str = "sensor",
     align_clocks: bool = False,
@@ -152,7 +227,9 @@ def calibrate(
     rig: with a guess of each pose, within 20 degrees and 1 m. Raises MlbatchError where the
     recording does not determine the poses.
     """
-    (guess,) = paths_of("rig", rig)
+    guess = rig_path(rig)
+    if guess is None:
+        raise UsageError("rig: expected a path or a mapping, found None; give the guess")
     job = calibrate_job(
         recordings,
         guess,

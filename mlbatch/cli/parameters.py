@@ -11,7 +11,6 @@ from typing import Annotated, Any, TypeAlias
 import typer
 
 from mlbatch import options
-from mlbatch.errors import UsageError
 from mlbatch.options import Option
 
 # The words, or a function that looks them up.
@@ -130,18 +129,6 @@ def with_parameters(command: Callable[..., None], added: Iterable[inspect.Parame
     signature = inspect.Signature([*named, *added])
     command.__signature__ = signature  # type: ignore[attr-defined]
     command.__annotations__ = {name: one.annotation for name, one in signature.parameters.items()}
-
-
-def shown_scans(text: str | None) -> int | None:
-    """`--html-scans`: a number, 0 for all, None for as many as the page has room for."""
-    if text is None or text == "all":
-        return None if text is None else 0
-    if not (text.isascii() and text.isdigit() and int(text)):
-        raise UsageError(
-            f"--html-scans: expected a number of scans from 1 on or all, found {text!r}; give "
-            "--html-scans 10"
-        )
-    return int(text)
 
 
 def is_stdout(path: Path | None) -> bool:

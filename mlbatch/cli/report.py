@@ -43,9 +43,9 @@ def report(
 ) -> None:
     """Write a page (HTML) of a run: verdict, timeline, fill, clocks, accounts, scans."""
     from mlbatch.bounded import MOST_BYTES
-    from mlbatch.cli.parameters import is_stdout, shown_scans
+    from mlbatch.cli.parameters import is_stdout
     from mlbatch.errors import UsageError, one_line
-    from mlbatch.page import check_page, find_source, source_of_text, write_page
+    from mlbatch.page import check_page, find_source, shown_scans, source_of_text, write_page
     from mlbatch.page.document import page_text
 
     if source == Path("-"):

@@ -10,7 +10,7 @@ from fractions import Fraction
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
-from mlbatch.cli.parameters import is_stdout, shown_scans
+from mlbatch.cli.parameters import is_stdout
 from mlbatch.cli.run import Target
 from mlbatch.errors import UsageError
 from mlbatch.options import INSTANTS
@@ -56,7 +56,12 @@ def target_of(values: Mapping[str, Any]) -> Target:
         output(values["output"], dry_run=values["dry_run"])
     report = values["report"]
     resume(values["resume"], dry_run=values["dry_run"])
-    html_scans = shown_scans(values["html_scans"])
+    html_scans: int | None = None
+    if values["html_scans"] is not None:
+        # Not loaded without a page.
+        from mlbatch.page import shown_scans
+
+        html_scans = shown_scans(values["html_scans"])
     if html_scans is not None and values["html"] is None:
         raise UsageError(
             "--html-scans: expected a page for the scans, found none; add --html FILE, or leave it "

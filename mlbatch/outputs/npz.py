@@ -10,10 +10,11 @@ from dataclasses import dataclass, field
 from functools import lru_cache
 from io import BytesIO
 from typing import cast
-from zipfile import ZIP_DEFLATED, ZIP_STORED, ZipFile
+from zipfile import ZIP_DEFLATED, ZIP_STORED, ZipFile, ZipInfo
 
 import numpy as np
 import numpy.typing as npt
+from isal.isal_zlib import crc32
 from numpy.lib.format import read_array_header_1_0, read_magic
 
 from mlbatch.arrays import F32Array, I64Array, U8Array, U16Array, U32Array
@@ -211,12 +212,22 @@ def _members(file: ScanFile) -> dict[str, bytes]:
                 raise DamageError(f"member {member.filename} stored or deflated", method)
             # Unpacks no more than the declared size.
             with archive.open(member) as stream:
-                content = stream.read(member.file_size)
+                content = _plain(data, member) or stream.read(member.file_size)
             if len(content) != member.file_size:
                 expected = f"{member.file_size} bytes of member {member.filename}"
                 raise DamageError(expected, str(len(content)))
             found[member.filename] = content
     return {name.removesuffix(".npy"): content for name, content in found.items()}
+
+
+def _plain(data: bytes, member: ZipInfo) -> bytes:
+    """The bytes of a member that is not compressed; none where they are damaged."""
+    # PKWARE APPNOTE 4.3.7; `zipfile` has compared the name. Its CRC takes a third of a read.
+    begin = member.header_offset + 30
+    begin += sum(int.from_bytes(data[at : at + 2], "little") for at in (begin - 4, begin - 2))
+    content = data[begin : begin + member.file_size]
+    is_plain = member.compress_type == ZIP_STORED and crc32(content, 0) == member.CRC
+    return content if is_plain else b""
 
 
 def _array(key: str, data: bytes) -> Values:

@@ -20,7 +20,7 @@ from mlbatch.outputs.containers import Message, MessagePlace
 from mlbatch.outputs.damage import CheckLog, DamageError
 from mlbatch.outputs.encoding import MessageCursor
 from mlbatch.outputs.folders import ScanFile, ScanReader, scan_files
-from mlbatch.outputs.kinds import FileFormat, format_of, kind_of
+from mlbatch.outputs.kinds import FileFormat, Kind, format_of, kind_of
 from mlbatch.outputs.metadata import RunMetadata, metadata_of_grid
 from mlbatch.outputs.run_files import PIECES, RunFiles, inner_texts, mcaps_of
 from mlbatch.outputs.scan import Scan
@@ -57,7 +57,10 @@ def read(path: Path, *, by_window: bool = False) -> Iterator[Scan]:
     damaged, unfinished or of another program.
     """
     _refuse_partial(path)
-    kind = kind_of(path)
+    return _read(path, kind_of(path), by_window=by_window)
+
+
+def _read(path: Path, kind: Kind, *, by_window: bool) -> Iterator[Scan]:
     log = CheckLog()
     if kind.name in ("mcap", "rosbag1", "rosbag2"):
         scans: MessageScans | None = None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import html
 import importlib
 from dataclasses import dataclass, field, fields, replace
 from types import ModuleType
@@ -170,6 +171,15 @@ class Scan:
             f"{self.start_ns} to {self.end_ns} ns {self.info.timescale}, {state}>"
         )
 
+    def _repr_html_(self) -> str:
+        arrays = ((one.name, getattr(self, one.name)) for one in fields(self))
+        shapes = [
+            f"{name:16} {one.dtype} {one.shape}"
+            for name, one in arrays
+            if isinstance(one, np.ndarray) and name not in self.absent
+        ]
+        return preformatted("\n".join([repr(self), *shapes]))
+
     # -- parts --------------------------------------------------------------------------------
 
     def __getitem__(self, sensor: str) -> Scan:
@@ -266,6 +276,28 @@ class Scan:
             table["stamp_ns"] = self.stamp_ns[valid]
         return pandas.DataFrame(table)
 
+    def plot(self, color: str = "height", axes: Any = None) -> Any:
+        """Draw all points from above into axes of matplotlib (None: new ones), and return these.
+
+        color: height, time, intensity or lidar. UsageError without matplotlib.
+        """
+        pyplot = _optional("matplotlib.pyplot", "plot", "matplotlib")
+        arrays = {"time": "time_ns", "intensity": "intensity", "lidar": "lidar_id"}
+        if color not in ("height", *arrays):
+            known = ", ".join(("height", *arrays))
+            raise UsageError(f"color: expected one of {known}, found {color!r}; choose one")
+        self._require(f"color {color}", arrays.get(color, "xyz"))
+        valid = self.is_valid
+        x, y, z = self.xyz[valid].T
+        values = z if color == "height" else getattr(self, arrays[color])[valid]
+        if axes is None:
+            _, axes = pyplot.subplots()
+        drawn = axes.scatter(x, y, s=0.3, c=values, linewidths=0, rasterized=True)
+        axes.set(xlabel="x, m", ylabel="y, m", title=f"scan {self.index}", aspect="equal")
+        unit = {"height": "z, m", "time": "time, ns", "intensity": "intensity", "lidar": "lidar"}
+        axes.figure.colorbar(drawn, ax=axes, label=unit[color])
+        return axes
+
     def to_open3d(self) -> Any:
         """An open3d.t.geometry.PointCloud (m, body frame); UsageError without open3d.
 
@@ -316,10 +348,16 @@ def _only(values: tuple[Any, ...], number: int, other: float) -> tuple[Any, ...]
     return tuple(value if i == number else other for i, value in enumerate(values))
 
 
-def _optional(package: str, method: str) -> ModuleType:
-    """A package that mlbatch does not depend on."""
+def preformatted(shown: object) -> str:
+    """The text of an object for notebooks, as HTML."""
+    return f"<pre>{html.escape(str(shown))}</pre>"
+
+
+def _optional(module: str, method: str, package: str = "") -> ModuleType:
+    """A module of a package that mlbatch does not depend on."""
+    package = package or module
     try:
-        return importlib.import_module(package)
+        return importlib.import_module(module)
     except ImportError as err:
         raise UsageError(
             f"{method}: expected the package {package}, found none ({err}); pip install {package}"

@@ -8,9 +8,17 @@ from pathlib import Path
 from mlbatch.bounded import open_file
 from mlbatch.errors import ExportError, write_error
 from mlbatch.page.document import page_text
-from mlbatch.page.source import Source, find_source, source_of_text
+from mlbatch.page.source import Source, find_source, shown_scans, source_of_text
 
-__all__ = ["Source", "check_page", "find_source", "source_of_text", "write_page", "write_text_page"]
+__all__ = [
+    "Source",
+    "check_page",
+    "find_source",
+    "shown_scans",
+    "source_of_text",
+    "write_page",
+    "write_text_page",
+]
 
 # First bytes of a page; only files that begin with them are replaced.
 MARK = b"<!DOCTYPE html>\n<!-- mlbatch page -->"

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from mlbatch.bounded import open_file
-from mlbatch.errors import ExportError, RecordingError
+from mlbatch.errors import ExportError, RecordingError, UsageError
 from mlbatch.outputs.folders import refuse_shard
 from mlbatch.outputs.kinds import REPORT
 from mlbatch.outputs.run_files import RunFiles
@@ -24,6 +24,17 @@ class Source:
     output: Path | None  # None: no scans
     page: Path  # usual place of the page
     scans: int | None = None  # number to show, 0: all; None: as many as the page has room for
+
+
+def shown_scans(text: str | None, option: str = "--html-scans") -> int | None:
+    """`scans` of a source by a text: a number, or all."""
+    if text is None or text == "all":
+        return None if text is None else 0
+    if not (text.isascii() and text.isdigit() and int(text)):
+        raise UsageError(
+            f"{option}: expected a number of scans from 1 on or all, found {text!r}; write 10"
+        )
+    return int(text)
 
 
 def source_of_text(where: Path, text: str | bytes) -> Source:

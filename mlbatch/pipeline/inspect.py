@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import html
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
@@ -136,7 +137,7 @@ RECORDING_HEAD = ("recording", "container", "MB", "start", "seconds")
 _BYTES_PER_MB = 1_000_000
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, repr=False)
 class Inspection:
     """All streams of the first 10 seconds of a session, or of all of it."""
 
@@ -152,6 +153,18 @@ class Inspection:
     topics: tuple[TopicReport, ...] = ()  # without packets
     point_times: tuple[TimeFinding, ...] = ()  # of decoded clouds
     poses: PoseFigures | None = None  # None: one lidar
+
+    def __repr__(self) -> str:
+        """The lidars, in a line."""
+        names = ", ".join(f"{one.name} {one.lidar.model}" for one in self.sensors)
+        return f"<Inspection of {len(self.streams)} streams: {names or 'no lidar'}>"
+
+    def _repr_html_(self) -> str:
+        rows = "".join(
+            f"<tr>{''.join(f'<td>{html.escape(cell)}</td>' for cell in row)}</tr>"
+            for row in (HEAD, *(one.row() for one in self.streams))
+        )
+        return f"<table>{rows}</table>"
 
     @property
     def first_host_ns(self) -> int | None:

@@ -52,7 +52,15 @@ from mlbatch.poses.turning import (
     refused_imu,
     turns_too_little,
 )
-from mlbatch.python.options import Moment, Names, Paths, recordings_of, session_job, window_job
+from mlbatch.python.options import (
+    Documents,
+    Moment,
+    Names,
+    Paths,
+    recordings_of,
+    session_job,
+    window_job,
+)
 from mlbatch.rig.rig import Rig, RigSensor, UnknownExtrinsics, read_rig
 from mlbatch.rig.write import write_rig
 from mlbatch.types import Scan
@@ -71,7 +79,7 @@ def calibrate_job(
     recordings: Paths | tuple[Paths, ...],
     rig: Path,
     *,
-    metadata: Paths = (),
+    metadata: Documents = (),
     clock: str = "sensor",
     align_clocks: bool = False,
     only: Names = (),

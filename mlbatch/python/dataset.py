@@ -68,30 +68,24 @@ class Dataset(Sequence[Scan]):
         session: name of the output; sensor: with `--split`; points: -1 where scans.csv has not the
         number of this scan; path: of the file with the scan. `pandas.DataFrame(dataset.table)`.
         """
-        rows = []
-        for output, own in self._places.tolist():
-            indexed = self._outputs[output]
-            place = indexed.places[own]
-            rows.append((indexed.path.name, *place))
-        names = ("session", "sensor", "index", "slice", "start_ns", "points", "path")
-        columns = zip(*rows, strict=True) if rows else [()] * len(names)
-        texts = ("session", "sensor", "path")
-        arrays = [
-            np.array(column, np.str_ if name in texts else np.int64)
-            for name, column in zip(names, columns, strict=True)
+        places = [
+            (self._outputs[output].path.name, *self._outputs[output].places[own])
+            for output, own in self._places.tolist()
         ]
-        table: Rows = np.zeros(
-            len(rows), [(name, one.dtype) for name, one in zip(names, arrays, strict=True)]
+        # Texts as wide as the longest.
+        widths = [max((len(row[at]) for row in places), default=1) for at in (0, 1, -1)]
+        session, sensor, path = (f"U{max(width, 1)}" for width in widths)
+        numbers = [(name, np.int64) for name in ("index", "slice", "start_ns", "points")]
+        return np.array(
+            places, [("session", session), ("sensor", sensor), *numbers, ("path", path)]
         )
-        for name, one in zip(names, arrays, strict=True):
-            table[name] = one
-        return table
 
     def __repr__(self) -> str:
         """Numbers of scans and outputs."""
         skipped = f", {len(self.skipped)} paths skipped" if self.skipped else ""
         used = len(np.unique(self._places[:, 0]))
-        return f"<Dataset: {len(self)} scans of {used} outputs{skipped}>"
+        outputs = "1 output" if used == 1 else f"{used} outputs"
+        return f"<Dataset: {len(self)} scans of {outputs}{skipped}>"
 
 
 def dataset_of(paths: Iterable[Path]) -> Dataset:

@@ -12,13 +12,16 @@ from mlbatch.pipeline.job import MOST_S
 from mlbatch.pipeline.time_limits import limits_of
 from mlbatch.python.options import (
     AnyPath,
+    Document,
+    Documents,
     Moment,
     Names,
     Paths,
+    metadata_paths,
     names_of,
-    path_of,
     paths_of,
     recordings_of,
+    rig_path,
 )
 from mlbatch.units import NS_PER_S
 
@@ -26,8 +29,8 @@ from mlbatch.units import NS_PER_S
 class ExtractOptions(TypedDict, total=False):
     """Options with the names of `mlbatch extract`; duration: s; copy_topics: as `--pass`."""
 
-    rig: AnyPath | None
-    metadata: Paths
+    rig: Document | None
+    metadata: Documents
     only: Names
     ignore: Names
     start: Moment | None
@@ -57,8 +60,8 @@ def extraction(
         recordings_of(recordings),
         target,
         SensorSelection(
-            rig=path_of("rig", options.get("rig")),
-            metadata=paths_of("metadata", options.get("metadata", ())),
+            rig=rig_path(options.get("rig")),
+            metadata=metadata_paths(options.get("metadata", ())),
             only=names_of(options.get("only", ())),
             ignore=names_of(options.get("ignore", ())),
         ),

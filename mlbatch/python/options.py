@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import atexit
 import difflib
 import inspect
+import json
 import math
+import shutil
+import tempfile
 import warnings
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
@@ -13,6 +17,8 @@ from numbers import Real
 from os import PathLike, fspath
 from pathlib import Path
 from typing import Any, Literal, TypeAlias, TypedDict, TypeVar
+
+import numpy as np
 
 from mlbatch.discovery.discover import SensorSelection
 from mlbatch.errors import UsageError
@@ -27,6 +33,7 @@ from mlbatch.pipeline.job import (
     wait_ns,
 )
 from mlbatch.readers.inputs import expand
+from mlbatch.rig.convert_keys import POSE_MODELS
 from mlbatch.units import parse_rate
 
 AnyPath: TypeAlias = "str | PathLike[str]"
@@ -34,6 +41,10 @@ AnyPath: TypeAlias = "str | PathLike[str]"
 Paths: TypeAlias = "AnyPath | Iterable[AnyPath]"
 Names: TypeAlias = "str | Iterable[str]"
 Rate: TypeAlias = int | float | str | Fraction
+# A document instead of its file.
+Document: TypeAlias = "AnyPath | Mapping[str, Any]"
+# By name, or without names.
+Documents: TypeAlias = "Paths | Mapping[str, Mapping[str, Any]] | Iterable[Document]"
 # Nanoseconds of the common clock; or a text as on the command line: ISO time, epoch seconds, +S.
 Moment: TypeAlias = int | str
 Box: TypeAlias = "tuple[float, float, float, float, float, float]"
@@ -41,6 +52,8 @@ Box: TypeAlias = "tuple[float, float, float, float, float, float]"
 F = TypeVar("F", bound=Callable[..., Any])
 
 _BOX_VALUES = 6
+# Of rigs: keys of files.
+_PATH_KEYS = ("metadata", "file", "deskew")
 
 
 def paths_of(what: str, values: Paths) -> tuple[Path, ...]:
@@ -64,6 +77,58 @@ def recordings_of(recordings: Paths | tuple[Paths, ...]) -> tuple[Path, ...]:
 def path_of(what: str, value: AnyPath | None) -> Path | None:
     """A path, or None."""
     return None if value is None else _path(what, value)
+
+
+def rig_path(value: Document | None) -> Path | None:
+    """The rig file; one that is given as a mapping is written first."""
+    return (
+        _written("rig", "rig.yaml", value) if isinstance(value, Mapping) else path_of("rig", value)
+    )
+
+
+def metadata_paths(values: Documents) -> tuple[Path, ...]:
+    """Files of metadata; those given as mappings, alone or by name, are written first."""
+    if isinstance(values, Mapping):
+        return tuple(_written("metadata", f"{name}.json", one) for name, one in values.items())
+    if isinstance(values, str | PathLike) or not isinstance(values, Iterable):
+        return paths_of("metadata", values)
+    return tuple(
+        _written("metadata", f"metadata{number}.json", one)
+        if isinstance(one, Mapping)
+        else _path("metadata", one)
+        for number, one in enumerate(values)
+    )
+
+
+def _written(what: str, name: str, document: object) -> Path:
+    """A file with a document, until the process ends; in it paths are absolute."""
+    if not isinstance(document, Mapping) or Path(name).name != name:
+        raise UsageError(
+            f"{what}: expected a document by its name, found {document!r:.40} by {name!r}; give "
+            "{'left': {...}}, or a list of documents"
+        )
+    try:
+        text = json.dumps(_with_paths(document), allow_nan=False)
+    except (TypeError, ValueError) as err:
+        raise UsageError(f"{what}: expected values of JSON, found {err}; correct it") from err
+    folder = tempfile.mkdtemp(prefix="mlbatch-")
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
+    path = Path(folder, name)
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+def _with_paths(value: object, key: str = "") -> object:
+    """The value with the paths of a rig from the current folder instead of that of its file."""
+    if isinstance(value, Mapping):
+        return {name: _with_paths(one, name) for name, one in value.items()}
+    if isinstance(value, np.ndarray):
+        return value.tolist()
+    if isinstance(value, list | tuple):
+        return [_with_paths(one, key) for one in value]
+    if key in _PATH_KEYS and isinstance(value, str | PathLike) and value not in POSE_MODELS:
+        return str(Path(fspath(value)).absolute())
+    return value
 
 
 def names_of(values: Names) -> tuple[str, ...]:
@@ -95,9 +160,9 @@ def choice(option: str, value: str, known: Iterable[str]) -> str:
 class SessionOptions(TypedDict, total=False):
     """Options that select recordings and sensors, with the names of `mlbatch convert`."""
 
-    rig: AnyPath | None
+    rig: Document | None
     dataset: str | None  # a recipe of `mlbatch datasets`
-    metadata: Paths
+    metadata: Documents
     only: Names
     ignore: Names
     identity_extrinsics: bool
@@ -217,7 +282,7 @@ def session_job(
     clock = choice(shown("clock"), options.get("clock", "sensor"), CLOCKS)
     align_to = choice(shown("align_to"), options.get("align_to", "host"), ALIGN_TO)
     aligned = options.get("align_clocks", False)
-    rig = path_of("rig", options.get("rig"))
+    rig = rig_path(options.get("rig"))
     if options.get("dataset") is not None:
         # Few runs have it.
         from mlbatch.rig.recipes import rig_of
@@ -227,7 +292,7 @@ def session_job(
         recordings=recordings_of(recordings),
         selection=SensorSelection(
             rig=rig,
-            metadata=paths_of("metadata", options.get("metadata", ())),
+            metadata=metadata_paths(options.get("metadata", ())),
             only=names_of(options.get("only", ())),
             ignore=names_of(options.get("ignore", ())),
             identity_extrinsics=options.get("identity_extrinsics", False),

@@ -24,7 +24,7 @@ from mlbatch.discovery.types import Note
 from mlbatch.errors import NoScanError, RecordingError, UsageError
 from mlbatch.native import require_library
 from mlbatch.outputs.inputs import open_inputs
-from mlbatch.outputs.scan import Scan
+from mlbatch.outputs.scan import Scan, preformatted
 from mlbatch.outputs.table import Rows, read_table
 from mlbatch.pipeline.conversion import Conversion, SkippedWindow
 from mlbatch.pipeline.ingest import Ingest
@@ -169,6 +169,9 @@ class Recording:
             cells = (cell.ljust(width) for cell, width in zip(row, widths, strict=True))
             lines.append("  ".join(cells).rstrip())
         return "\n".join(lines)
+
+    def _repr_html_(self) -> str:
+        return preformatted(self)
 
     # -- scans --------------------------------------------------------------------------------
 

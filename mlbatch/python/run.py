@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from mlbatch.options import INSTANTS
+from mlbatch.outputs.scan import preformatted
 from mlbatch.pipeline.job import Job, check_max_bag_s
 from mlbatch.pipeline.output import Output, OutputRequest
 from mlbatch.python.options import OutputOptions, choice, names_of, path_of
@@ -87,13 +88,26 @@ class Report:
         return "\n".join(summary_lines(self.content))
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, repr=False)
 class Run:
     """A finished conversion; path: of its output, or of a map alone; None after a dry run."""
 
     path: Path | None
     report: Report
     report_path: Path | None
+
+    def __repr__(self) -> str:
+        """One line; `print(run.report)` prints all that the command does."""
+        sensors = ", ".join(self.report.sensors)
+        scans, warnings = self.report.scans, len(self.report.warnings)
+        output = "dry run" if self.path is None else self.path.name
+        return (
+            f"<Run {output}: {scans.written} scans of {sensors}, {scans.points} points, "
+            f"{warnings} warnings>"
+        )
+
+    def _repr_html_(self) -> str:
+        return preformatted(self.report)
 
 
 def run_job(job: Job, path: Path | None, options: OutputOptions) -> Run:

@@ -260,6 +260,6 @@ def test_the_root_offers_its_names_without_loading_them() -> None:
     )
     names = [
         *("Calibration", "Dataset", "MlbatchError", "Recording", "Run", "Scan", "calibrate"),
-        *("convert", "dataset", "digest", "extract", "inspect", "open"),
+        *("compare", "convert", "dataset", "digest", "extract", "inspect", "open"),
     ]
-    assert printed.strip() == str([*names, "read", "scans", "verify"])
+    assert printed.strip() == str([*names, "read", "report", "scans", "verify"])
