@@ -66,8 +66,9 @@ class _Function(ModuleType):
     """A package that has the name of a function of `mlbatch.api`, which a call of it calls."""
 
     def __call__(self, *args: Any, **kwargs: Any) -> Any:
-        from mlbatch import api
+        import importlib
 
+        api = importlib.import_module("mlbatch.api")
         return getattr(api, self.__name__.rpartition(".")[2])(*args, **kwargs)
 
 
