@@ -100,26 +100,10 @@ class Comparison:
         return f"{self.compared_s:.1f} s of {sensors}; windows at {self.rate_hz} Hz; times in ms"
 
     def figures(self) -> list[PolicyFigures]:
-        """Figures of each policy, for pages and plots."""
-        starts_ns = [one.series.first_ns for one in self.reports if one.series is not None]
-        begin_ns = min((int(start.min()) for start in starts_ns if len(start)), default=0)
-        return [
-            PolicyFigures(
-                name=one.policy,
-                sets=one.sets,
-                without_a_sensor=one.without_a_sensor,
-                stale=one.stale,
-                columns=one.columns,
-                used_twice=one.used_twice,
-                never_used=one.never_used,
-                start_s=(one.series.first_ns - begin_ns) / NS_PER_S,
-                span_ms=one.series.span_ns / NS_PER_MS,
-                apart_ms=one.series.apart_ns / NS_PER_MS,
-                latency_ms=one.series.latency_ns / NS_PER_MS,
-            )
-            for one in self.reports
-            if one.series is not None
-        ]
+        """Figures of each policy, for pages and plots; starts after the first set of all."""
+        series = [one.series for one in self.reports if one.series is not None]
+        begin_s = min((float(one.start_s.min()) for one in series if one.sets), default=0.0)
+        return [replace(one, start_s=one.start_s - begin_s) for one in series]
 
     def as_json(self) -> dict[str, Value]:
         """The JSON document."""

@@ -8,9 +8,9 @@ from dataclasses import asdict, dataclass, field, replace
 
 import numpy as np
 
-from mlbatch.arrays import I64Array
 from mlbatch.batching.sweeps import Sweep, SweepSet
-from mlbatch.units import NS_PER_MS
+from mlbatch.page.policies import PolicyFigures
+from mlbatch.units import NS_PER_MS, NS_PER_S
 
 # A sweep is stale in a set whose newest column is more than this many periods newer than its own.
 STALE_PERIODS = 2
@@ -51,20 +51,6 @@ class Distribution:
 
 
 @dataclass(frozen=True, slots=True)
-class SetSeries:
-    """Times of every set of a policy, in the order of publication, (n,) ns each.
-
-    first_ns: of its first column; span_ns: to its last one; apart_ns: as `SetReport.apart_ms`, 0
-    with one sensor; latency_ns: from its first column until the set is complete.
-    """
-
-    first_ns: I64Array
-    span_ns: I64Array
-    apart_ns: I64Array
-    latency_ns: I64Array
-
-
-@dataclass(frozen=True, slots=True)
 class SetReport:
     """Figures of the sets of one join policy, or of windows."""
 
@@ -86,7 +72,8 @@ class SetReport:
     never_used: int
     # From the first column of a set until the set is complete.
     latency_ms: Distribution = Distribution()
-    series: SetSeries | None = field(default=None, compare=False, repr=False)
+    # Of every set, in the order of publication; starts in s of the common clock.
+    series: PolicyFigures | None = field(default=None, compare=False, repr=False)
 
     def row(self) -> list[str]:
         """Cells of the table, as HEAD."""
@@ -169,11 +156,18 @@ class SetStatistics:
             used_twice=self._used_twice,
             never_used=columns - undecided - self._used,
             latency_ms=Distribution.of(self._latencies_ns),
-            series=SetSeries(
-                np.array(self._firsts_ns, np.int64),
-                np.array(self._spans_ns, np.int64),
-                np.array(self._all_aparts_ns, np.int64),
-                np.array(self._latencies_ns, np.int64),
+            series=PolicyFigures(
+                name=self._policy,
+                sets=self._sets,
+                without_a_sensor=self._without,
+                stale=self._stale,
+                columns=columns - undecided,
+                used_twice=self._used_twice,
+                never_used=columns - undecided - self._used,
+                start_s=np.array(self._firsts_ns, np.int64) / NS_PER_S,
+                span_ms=np.array(self._spans_ns, np.int64) / NS_PER_MS,
+                apart_ms=np.array(self._all_aparts_ns, np.int64) / NS_PER_MS,
+                latency_ms=np.array(self._latencies_ns, np.int64) / NS_PER_MS,
             ),
         )
 

@@ -45,7 +45,7 @@ def calibration_page(title: str, found: Calibration, command: str) -> str:
         title=title,
         verdict=_verdict(found),
         size=_SIZE,
-        names=[(_kind(number), lidar.name) for number, lidar in enumerate(found.lidars)],
+        names=[lidar.name for lidar in found.lidars],
         cuts=[]
         if found.view is None
         else [_pictures(found.view, cut) for cut in _cuts(found.view.after)],
@@ -78,11 +78,6 @@ def _verdict(found: Calibration) -> Verdict:
     if found.level:
         others += f" {found.level}."
     return Verdict("note" if found.level else "good", "Calibration", heading, others, found.title())
-
-
-def _kind(number: int) -> str:
-    """The class of a lidar in the style sheet."""
-    return f"k{number % 4}"
 
 
 # -- pictures -------------------------------------------------------------------------------------
@@ -144,14 +139,10 @@ def _pictures(view: View, cut: _Cut) -> dict[str, object]:
         "title": cut.title,
         "about": f"{across} to the right, {up} up; {2 * cut.half_m:.1f} m wide",
         "pictures": [
-            ("with the guess", _paths(view.before, cut)),
-            ("calibrated", _paths(view.after, cut)),
+            ("with the guess", [_dots(cloud, cut) for cloud in view.before]),
+            ("calibrated", [_dots(cloud, cut) for cloud in view.after]),
         ],
     }
-
-
-def _paths(clouds: Clouds, cut: _Cut) -> list[tuple[str, str]]:
-    return [(_kind(number), _dots(cloud, cut)) for number, cloud in enumerate(clouds)]
 
 
 def _dots(cloud: F32Array, cut: _Cut) -> str:

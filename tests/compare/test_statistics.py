@@ -50,6 +50,6 @@ def test_latency_is_the_age_of_the_first_column() -> None:
     report = statistics.report(400)
     assert (report.latency_ms.min, report.latency_ms.max) == (140, 165)
     assert report.series is not None
-    assert report.series.first_ns.tolist() == [0, 100 * NS_PER_MS]
-    assert report.series.latency_ns.tolist() == [140 * NS_PER_MS, 165 * NS_PER_MS]
-    assert report.series.apart_ns.tolist() == [40 * NS_PER_MS] * 2
+    assert report.series.start_s.tolist() == [0, 0.1]
+    assert report.series.latency_ms.tolist() == [140, 165]
+    assert report.series.apart_ms.tolist() == [40] * 2
