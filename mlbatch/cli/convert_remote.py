@@ -20,7 +20,7 @@ from mlbatch.errors import ExportError, RecordingError, UsageError
 
 _OUTPUT = ("-o", "--output")
 # Files that are written apart from the output.
-_LOCAL_ONLY = ("--report", "--html")
+_LOCAL_ONLY = ("--report", "--html", "--accumulate")
 
 
 def convert_remote(given: Sequence[str]) -> None:
