@@ -67,6 +67,7 @@ class SensorSelection:
     host_clock: bool = False  # receive times replace timestamps
     aligned: bool = False  # --align-clocks: clocks need not be comparable
     decode: dict[str, str] = field(default_factory=dict)  # options of vendors
+    offset_ns: dict[str, int] = field(default_factory=dict)  # besides those of the rig, by name
 
 
 class Ignored(NamedTuple):
@@ -223,6 +224,7 @@ def discover(
     notes += _unused(matched.sensors, selection.metadata)
     for sensor in chosen:
         sensor.offset_ns = _rig_offset_ns(sampler, sensor)
+        sensor.offset_ns += selection.offset_ns.get(sensor.name, 0)
     notes += first.clouds_apart(chosen)
     if to_convert:
         _refuse_shared_addresses(sampler, chosen)

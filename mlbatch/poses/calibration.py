@@ -64,7 +64,7 @@ _LEAST_DELAY_S = 0.002
 _AT_REST_MPS, _AT_REST_RADPS = 0.05, 0.01
 # Digits of poses that are written: micrometres, and degrees.
 _DIGITS = 6
-_MS_PER_S = 1000.0
+MS_PER_S = 1000.0
 SCHEMA = "mlbatch.calibration/1"
 
 
@@ -452,8 +452,8 @@ def _lidar_poses(
                 turn / RAD_PER_DEG,
                 MM_PER_M * moved_m,
                 turned_rad / RAD_PER_DEG,
-                _MS_PER_S * float(found.state.delay_s[number]),
-                _MS_PER_S * float(np.sqrt(covariance[6, 6])) if delays else 0.0,
+                MS_PER_S * float(found.state.delay_s[number]),
+                MS_PER_S * float(np.sqrt(covariance[6, 6])) if delays else 0.0,
                 is_fixed=False,
             )
         )
@@ -635,7 +635,7 @@ def _refuse_late(problem: Problem, found: Solution, names: Sequence[str]) -> Non
         if sigma < _MOST_DELAY_SIGMA_S and abs(delay) > max(_LEAST_DELAY_S, 5.0 * sigma):
             raise _refused(
                 f"timestamps of {name} that agree with those of {names[0]}",
-                f"a delay of {-_MS_PER_S * delay:.1f} ms (+- {_MS_PER_S * sigma:.1f}), which poses "
+                f"a delay of {-MS_PER_S * delay:.1f} ms (+- {MS_PER_S * sigma:.1f}), which poses "
                 "without it would hide",
                 "give --time-offset",
             )

@@ -26,6 +26,7 @@ from mlbatch.pipeline.job import Job
 from mlbatch.poses.calibration import (
     MOST_OFF_DEG,
     MOST_OFF_M,
+    MS_PER_S,
     Calibration,
     LidarPose,
     Undetermined,
@@ -69,6 +70,8 @@ from mlbatch.writers import check_name
 
 # Windows in which a machine moves evenly, Hz.
 _RATE = 10
+# A delay that moves a window by a part of itself, s.
+_LATE_S = 0.005
 # Windows that turns of an IMU are compared in, where motion is not measured anyway.
 _MOST_IMU_WINDOWS = 600
 # The ground is rarely more level.
@@ -175,9 +178,8 @@ def _imus(
             continue
         if motion is None:
             poses = [run.session.setup.sensors[0].pose.body_from_sensor]
-            with contextlib.closing(_scans(Conversion(run.job), progress)) as scans:
-                windows = _motion_windows(islice(scans, _MOST_IMU_WINDOWS), poses)
-                motion = poses_from_motion(windows, [found.lidars[0].name])
+            again, names = Conversion(run.job), [found.lidars[0].name]
+            motion = _motion(again, poses, names, progress, _MOST_IMU_WINDOWS)
         seen, first = motion.twist[0, :, 3:], found.lidars[0].body_from_sensor[:3, :3]
         known = None if stated is None else stated[:3, :3]
         yield imu_rotation(seen, motion.middle_ns, turns, name, first, known)
@@ -213,10 +215,18 @@ def _calibrated(
 ) -> tuple[Calibration, MotionPoses | None]:
     job = run.job
     poses = [sensor.pose.body_from_sensor for sensor in run.session.setup.sensors]
+    zeros = np.zeros(len(names))
     if not (from_motion or time_offset):
         return calibrated(_places(run, progress), names, poses), None
-    with contextlib.closing(_scans(run, progress)) as scans:
-        motion = poses_from_motion(_motion_windows(scans, poses), names)
+    motion = _motion(run, poses, names, progress)
+    offset_s = -np.nan_to_num([pose.late_s for pose in motion.poses]) if time_offset else zeros
+    if np.abs(offset_s).max() > _LATE_S:
+        # Windows with the same motion of all lidars.
+        offset_ns = {name: round(s * NS_PER_S) for name, s in zip(names, offset_s, strict=True)}
+        job = replace(job, selection=replace(job.selection, offset_ns=offset_ns))
+        motion = _motion(Conversion(job), poses, names, progress)
+    else:
+        offset_s = zeros
     if from_motion and motion.refusal:
         raise RecordingError(f"calibrate: {motion.refusal}")
     moved = motion_poses(poses[0], motion)
@@ -247,6 +257,11 @@ def _calibrated(
                 "calibrate: expected surfaces in common and motion that fix the poses, found "
                 f"neither: {'; '.join(word for word, _, _ in words)}; {words[-1][2]}"
             ) from err
+    lidars = zip(found.lidars, offset_s.tolist(), strict=True)
+    found = replace(
+        found,
+        lidars=tuple(replace(one, delay_ms=one.delay_ms + MS_PER_S * s) for one, s in lidars),
+    )
     if not from_motion:
         return found, motion
     back = inverse(found.lidars[0].body_from_sensor)
@@ -254,6 +269,18 @@ def _calibrated(
     if wrong := contradiction(motion, [Pose(own[:3, :3], own[:3, 3]) for own in relative], names):
         raise RecordingError(f"calibrate: {wrong}")
     return found, motion
+
+
+def _motion(
+    run: Conversion,
+    poses: Sequence[F64Array],
+    names: Sequence[str],
+    progress: Progress | None,
+    most: int | None = None,
+) -> MotionPoses:
+    """The motion of some lidars, the first ones of a run, in all or `most` windows."""
+    with contextlib.closing(_scans(run, progress)) as scans:
+        return poses_from_motion(_motion_windows(islice(scans, most), poses), names)
 
 
 def _places(run: Conversion, progress: Progress | None) -> Places:

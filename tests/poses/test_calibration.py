@@ -243,6 +243,21 @@ def test_motion_needs_no_guess(tmp_path: Path) -> None:
     assert "; the IMU of left: rotation_rpy_deg [" in rig.read_text(encoding="utf-8")
 
 
+def test_a_clock_that_is_a_third_of_a_second_ahead(tmp_path: Path) -> None:
+    """Far more than surfaces alone find; the turns of both lidars say it."""
+    head, sway = MOTION.split("  sway:")
+    more = "    - [5, -0.8, 0.2, 1.2, 320]\n    - [8, 0.6, -0.3, 1.2, 520]\n"
+    sensors = SENSORS.replace("{name: right", "{name: right, clock: {offset_s: 0.3}")
+    text = scenario_text(sensors, motion=f"{head}{more}  sway:{sway}", duration=7)
+    drive = record(tmp_path, text)
+    guess = guessed(drive.rig, tmp_path / "guess.yaml", [0.1, 0.1, -0.05], [2, 1, 5])
+    _, right = mlbatch.calibrate(drive.path, guess, time_offset=True).lidars
+    error_mm, error_deg = off(right, true_pose(read_rig(drive.rig), "right"))
+    assert right.delay_ms == pytest.approx(-300.0, abs=4 * right.delay_sigma_ms)
+    assert np.abs(error_mm).max() < 5
+    assert np.abs(error_deg).max() < 0.1
+
+
 def test_too_little_motion_gives_no_pose(room: Recorded) -> None:
     with pytest.raises(RecordingError, match="calibrate: right: expected 30 windows"):
         mlbatch.calibrate(room.path, _unknown(room.rig), from_motion=True)
