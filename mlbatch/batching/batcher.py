@@ -133,19 +133,19 @@ class Batcher:
         if self.t_init_ns is None:
             self._begin_after(max(firsts))
         self._watermark = FOREVER
-        # Scans that are batched again reach to their end; what they lack is in their gaps.
+        last_ns = max(track.newest_ns for track in self._tracks)
         covered = self._policy.covered
-        end_ns = NEVER if covered is None else covered.end_ns
-        newest_ns = [max(track.newest_ns, end_ns) for track in self._tracks]
+        if covered is not None:
+            last_ns = covered.end_ns
         yield from self._publish(
             Progress(
-                np.array([[one_ns] * 2 for one_ns in newest_ns]),
+                np.array([[track.newest_ns] * 2 for track in self._tracks]),
                 np.array([NEVER, FOREVER]),
                 np.array([host_ns]),
             ),
-            last_of_all=max(newest_ns),
+            last_of_all=last_ns,
         )
-        yield from self._short(min(firsts), max(newest_ns))
+        yield from self._short(min(firsts), last_ns)
 
     # -- state for reports and for the packet ring ----------------------------------------------
 
@@ -397,6 +397,7 @@ class Batcher:
         if until <= self._until:
             return []
         self._until = until
+        covered = self._policy.covered
         merged = self._take_until(until)
         cuts = self._cuts(merged.stamp_ns)
         figures = self._merge.figures(merged, [stop for _, stop, _ in cuts])
@@ -425,7 +426,9 @@ class Batcher:
                 slice=window % self._grid.slices,
                 start_ns=start,
                 end_ns=end,
-                complete=reached >= end and self._is_covered(start, end),
+                complete=(reached >= end and self._is_covered(start, end))
+                if covered is None
+                else covered.is_complete(start, end),
                 ready_host_ns=ready,
                 columns=columns,
                 figures=own,
@@ -483,11 +486,6 @@ class Batcher:
 
     def _is_covered(self, start: int, end: int) -> bool:
         """True if every sensor began by the start, and no stall overlaps."""
-        covered = self._policy.covered
-        if covered is not None:
-            if any(before < end and after > start for before, after in covered.gaps):
-                return False
-            start = max(start, covered.first_end_ns - 1)
         for track in self._tracks:
             if track.first_ns > start:
                 return False

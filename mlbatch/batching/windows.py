@@ -38,12 +38,11 @@ class Limit:
 class Coverage:
     """What the scans of an earlier run cover in time, as far as they were read.
 
-    begin_ns, first_end_ns: of the first scan, 0 before it; end_ns: of the last; gaps: (begin, end)
-    of incomplete ones, neighbours joined.
+    begin_ns: start of the first scan, 0 before it; end_ns: of the last; gaps: (begin, end) of
+    incomplete and absent ones, neighbours joined.
     """
 
     begin_ns: int = 0
-    first_end_ns: int = 0
     end_ns: int = 0
     gaps: list[tuple[int, int]] = field(default_factory=list)
 
@@ -55,13 +54,17 @@ class Coverage:
     def add(self, start_ns: int, end_ns: int, *, is_complete: bool) -> None:
         """Add the next scan."""
         if not self.begin_ns:
-            self.begin_ns = start_ns
-            self.first_end_ns = end_ns
+            self.begin_ns = self.end_ns = start_ns
+        gap_ns = (self.end_ns, start_ns if is_complete else end_ns)
+        if gap_ns[0] < gap_ns[1]:
+            touches = bool(self.gaps) and self.gaps[-1][1] == gap_ns[0]
+            begin_ns = self.gaps.pop()[0] if touches else gap_ns[0]
+            self.gaps.append((begin_ns, gap_ns[1]))
         self.end_ns = end_ns
-        if not is_complete:
-            touches = bool(self.gaps) and self.gaps[-1][1] == start_ns
-            begin_ns = self.gaps.pop()[0] if touches else start_ns
-            self.gaps.append((begin_ns, end_ns))
+
+    def is_complete(self, start_ns: int, end_ns: int) -> bool:
+        """Whether a window is in complete scans."""
+        return not any(begin < end_ns and end > start_ns for begin, end in self.gaps)
 
 
 class Policy(NamedTuple):

@@ -123,16 +123,17 @@ class OutputRecording(WrappedRecording):
         """Yield the columns of all scans, and the messages to keep; each call is a new pass."""
         if self.coverage is not None:
             self.coverage.begin()
-        for batch, scans in self._parts():
-            if batch is not None and batch.messages:
-                yield batch
-            for scan in scans:
-                if self.coverage is not None:
-                    self.coverage.add(scan.start_ns, scan.end_ns, is_complete=scan.complete)
-                packets = self._packets(scan)
-                self.inner.counts.frames += len(packets)
-                self.inner.counts.datagrams += len(packets)
-                yield packets
+        with contextlib.closing(self._parts()) as parts:
+            for batch, scans in parts:
+                if batch is not None and batch.messages:
+                    yield batch
+                for scan in scans:
+                    if self.coverage is not None:
+                        self.coverage.add(scan.start_ns, scan.end_ns, is_complete=scan.complete)
+                    packets = self._packets(scan)
+                    self.inner.counts.frames += len(packets)
+                    self.inner.counts.datagrams += len(packets)
+                    yield packets
 
     def _parts(self) -> Generator[tuple[PacketBatch | None, Iterator[Scan]], None, None]:
         """Batches of the container without packets, each with its scans."""

@@ -63,8 +63,13 @@ def _assert_equal(found: list[Scan], expected: list[Scan], step_ns: int) -> None
 
 
 def _converted(source: Path, output: Path, **options: Any) -> list[Scan]:
-    mlbatch.convert(source, output, **options)
+    found = _made(source, output, **options)
     assert mlbatch.verify(output).ok
+    return found
+
+
+def _made(source: Path, output: Path, **options: Any) -> list[Scan]:
+    mlbatch.convert(source, output, **options)
     return sorted(mlbatch.read(output), key=lambda one: (one.start_ns, one.sensor))
 
 
@@ -126,6 +131,23 @@ def test_incomplete_scans_stay_incomplete(shell: Shell, tmp_path: Path) -> None:
     assert {one.complete for one in first} == {True, False}
     again = _converted(tmp_path / "npz", tmp_path / "again", format="npz")
     _assert_equal(again, first, 0)
+    # Half as many windows: one is complete where both were.
+    slow = _converted(tmp_path / "npz", tmp_path / "slow", format="npz", rate=5)
+    whole = {one.start_ns for one in first if one.complete}
+    assert {one.complete for one in slow} == {True, False}
+    for one in slow:
+        halves = {one.start_ns, one.start_ns + 100_000_000}
+        assert one.complete == (halves <= whole)
+
+
+def test_windows_next_to_dropped_ones_stay_complete(tmp_path: Path) -> None:
+    rig = MOVING / "moving.rig.yaml"
+    first = _converted(MOVING / "moving.mcap", tmp_path / "npz", rig=rig, format="npz")
+    assert all(one.complete for one in first)
+    for one in first[5:18]:
+        (tmp_path / "npz" / f"{one.index:06d}.npz").unlink()
+    again = _made(tmp_path / "npz", tmp_path / "again", format="npz")
+    _assert_equal(again, first[:5] + first[18:], 0)
 
 
 def test_ranges_count_from_the_lidar(tmp_path: Path) -> None:
