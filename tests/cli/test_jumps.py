@@ -6,7 +6,6 @@ import json
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from tests.builders.bags import Body, Recorded, transforms_message
@@ -58,33 +57,6 @@ def test_a_gap_is_no_jump(shell: Shell, tmp_path: Path) -> None:
     outcome = shell("convert drive.pcap -o out --on-jump split")
     assert outcome.code == 0, outcome.err
     assert (tmp_path / "out" / "report.json").is_file()
-
-
-@pytest.mark.parametrize("steps_ns", [(FORWARD,), (BACK,), (FORWARD, BACK, FORWARD)])
-def test_every_stretch_becomes_an_output(
-    shell: Shell, tmp_path: Path, steps_ns: tuple[int, ...]
-) -> None:
-    pieces = _pieces(Unit(), *steps_ns)
-    write_session(tmp_path, *pieces)
-    outcome = shell("convert drive.pcap -o out --on-jump split --keep-partial")
-    assert outcome.code == 0, outcome.err
-    names = sorted(path.name for path in tmp_path.glob("out*"))
-    assert names == [f"out.seg{number + 1}" for number in range(len(pieces))]
-    read = 0
-    for piece, name in zip(pieces, names, strict=True):
-        report = json.loads((tmp_path / name / "report.json").read_text())
-        (sensor,) = report["sensors"]
-        read += sensor["packets"]["read"]
-        assert sensor["packets"]["accepted"] == 6 * 32
-        assert sensor["columns"]["dropped"] == {}
-        assert report["capture"]["datagrams"] == 6 * 32
-        # Eq. (1): the first point of the grid after the first stamp.
-        assert report["grid"]["t_init_ns"] == -(-piece.begin_ns // TURN_NS) * TURN_NS
-        stamps = [
-            np.load(path)["column_stamp_ns"] for path in sorted((tmp_path / name).glob("*.npz"))
-        ]
-        assert sum(map(len, stamps)) == 6 * 512
-    assert read == len(pieces) * 6 * 32
 
 
 def test_the_other_sensors_are_cut_at_the_same_time(shell: Shell, tmp_path: Path) -> None:

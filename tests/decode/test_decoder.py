@@ -1,4 +1,4 @@
-"""Columns to points: positions, labels and counts by hand, and laws of buffers."""
+"""Columns to points: positions and counts by hand; all else: `tests/decode/test_engine.py`."""
 
 from __future__ import annotations
 
@@ -34,7 +34,6 @@ FLAT = OusterSpec(
     beam_offset_mm=(0.0, 0.0),
     lidar_to_sensor_mm=np.diag([-1.0, -1.0, 1.0, 1.0]).ravel().tolist(),
 )
-DUAL = replace(FLAT, profile="RNG19_RFL8_SIG16_NIR16_DUAL")
 
 
 @dataclass
@@ -154,22 +153,6 @@ def test_beams_begin_at_their_distance_from_the_axis(tmp_path: Path) -> None:
     assert _xyz(scan) == [[0.016, -3.984, 0], [4, 0, 0]]
 
 
-# -- labels of points -----------------------------------------------------------------------------
-
-
-def test_points_are_sorted_by_column_then_channel(tmp_path: Path) -> None:
-    ranges = _ranges(c7_b3=1000, c7_b5=2000, c2_b9=3000)
-    one = StoredSensor(tmp_path, FLAT, {"RANGE": ranges}, ring_base=40)
-    scan = _scan(_decoder(one), [one], [(0, 7), (0, 0), (0, 2)])
-    assert scan.ring.tolist() == [43, 45, 49]
-    assert scan.column is not None
-    assert scan.column.tolist() == [0, 0, 2]
-    assert scan.time_ns.tolist() == [0, 0, 200_000]
-    assert scan.lidar_id.tolist() == [0, 0, 0]
-    assert (scan.points, scan.columns_per_sensor, scan.max_gap_ns) == (3, (3,), (100_000,))
-    assert (scan.index, scan.start_ns, scan.complete) == (3, START_NS, True)
-
-
 # -- slots without a point ------------------------------------------------------------------------
 
 
@@ -184,43 +167,6 @@ def test_a_window_without_a_column_gives_an_empty_scan(tmp_path: Path, layout: s
     one = StoredSensor(tmp_path, FLAT, {"RANGE": _ranges()})
     scan = _scan(_decoder(one, layout=layout), [one], [])
     assert (scan.points, len(scan.xyz), len(scan.column_stamp_ns)) == (0, 0, 0)
-
-
-# -- organized ------------------------------------------------------------------------------------
-
-
-def test_organized_slots_are_channel_by_return(tmp_path: Path) -> None:
-    first = StoredSensor(tmp_path, FLAT, {"RANGE": _ranges(c0_b3=1000)})
-    weak = _ranges(c1_b2=2000)
-    second = StoredSensor(
-        tmp_path, DUAL, {"RANGE": _ranges(c1_b2=3000), "RANGE2": weak}, ring_base=16
-    )
-    decoder = _decoder(first, second, layout="organized")
-    scan = _scan(decoder, [first, second], [(0, 0), (1, 1)])
-    assert scan.xyz.shape == (2, 32, 3)
-    assert scan.range_m is not None
-    assert np.argwhere(~np.isnan(scan.range_m)).tolist() == [[0, 3], [1, 4], [1, 5]]
-    assert scan.range_m[1, 4:6].tolist() == [3.0, 2.0]
-    assert scan.ring[0, 3] == 3
-    assert scan.ring[1, 4:6].tolist() == [18, 18]
-    empty = np.isnan(scan.range_m)
-    assert np.isnan(scan.xyz[empty]).all()
-    assert not scan.ring[empty].any()
-    assert not scan.time_ns[empty].any()
-    assert scan.lidar_id.tolist() == [[0] * 32, [1] * 32]
-    assert (scan.points, scan.column) == (3, None)
-
-
-# -- tiles and buffers ----------------------------------------------------------------------------
-
-
-def test_a_smaller_scan_after_a_larger_one_has_no_stale_points(tmp_path: Path) -> None:
-    one = StoredSensor(tmp_path, FLAT, {"RANGE": _ranges(1000, c9_b4=0)})
-    decoder = _decoder(one)
-    assert _scan(decoder, [one], [(0, mid) for mid in range(100)]).points == 1599
-    scan = _scan(decoder, [one], [(0, 9)])
-    assert (scan.points, len(scan.xyz), len(scan.ring)) == (15, 15, 15)
-    assert decoder.counts[0].written == 1599 + 15
 
 
 # -- coverage of a revolution --------------------------------------------------------------------

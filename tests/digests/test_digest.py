@@ -16,7 +16,6 @@ from mlbatch.digests import compare, golden_text, read_golden
 from mlbatch.digests.golden import describe
 from mlbatch.errors import MlbatchError
 from tests.builders.run import TWO_LIDARS, command
-from tests.golden.digest_recordings import rig_of, write_recordings
 
 CAPTURE = TWO_LIDARS / "two_lidars.pcap"
 RIG = TWO_LIDARS / "rig.yaml"
@@ -117,42 +116,6 @@ def test_a_file_gives_the_document_back(tmp_path: Path) -> None:
 
 
 # -- the same ---------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("kind", FORMATS)
-def test_jobs_give_the_same(kind: str, tmp_path: Path) -> None:
-    runs = [("--jobs", "1"), ("--jobs", "3")]
-    texts = {
-        golden_text(mlbatch.digest(convert(tmp_path / str(number), kind, *run)))
-        for number, run in enumerate(runs)
-    }
-    assert len(texts) == 1
-
-
-@pytest.fixture(scope="module")
-def recordings(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The fixtures in every container."""
-    folder = tmp_path_factory.mktemp("recordings")
-    write_recordings(folder / "in")
-    return folder / "in"
-
-
-@pytest.mark.parametrize("recording", ["two_lidars", "four_makers"])
-@pytest.mark.parametrize("kind", ["npz", "mcap"])
-def test_containers_give_the_same(
-    recording: str, kind: str, recordings: Path, tmp_path: Path
-) -> None:
-    found = []
-    for container in ("pcap", "pcapng", "mcap", "bag", "db3"):
-        folder = recordings / recording
-        output = tmp_path / container / FORMATS[kind][0]
-        output.parent.mkdir()
-        rig = folder / rig_of(recording, container)
-        words = ("--rig", rig, "-o", output, "--quiet")
-        assert command("convert", folder / f"drive.{container}", *words).code == 0
-        found.append(mlbatch.digest(output))
-    for other in found[1:]:
-        assert list(map(str, compare(found[0], other).differences)) == []
 
 
 def test_an_mcap_file_alone_has_its_report_inside(tmp_path: Path) -> None:
