@@ -72,8 +72,8 @@ from mlbatch.writers import check_name
 _RATE = 10
 # A delay that moves a window by a part of itself, s.
 _LATE_S = 0.005
-# Windows that turns of an IMU are compared in, where motion is not measured anyway.
-_MOST_IMU_WINDOWS = 600
+# Windows that motion is measured in for IMUs and delays; where poses begin with it, in all.
+_MOST_TURNS = 300
 # The ground is rarely more level.
 _LEVEL_DEG = 2.0
 
@@ -179,7 +179,7 @@ def _imus(
         if motion is None:
             poses = [run.session.setup.sensors[0].pose.body_from_sensor]
             again, names = Conversion(run.job), [found.lidars[0].name]
-            motion = _motion(again, poses, names, progress, _MOST_IMU_WINDOWS)
+            motion = _motion(again, poses, names, progress, _MOST_TURNS)
         seen, first = motion.twist[0, :, 3:], found.lidars[0].body_from_sensor[:3, :3]
         known = None if stated is None else stated[:3, :3]
         yield imu_rotation(seen, motion.middle_ns, turns, name, first, known)
@@ -218,13 +218,14 @@ def _calibrated(
     zeros = np.zeros(len(names))
     if not (from_motion or time_offset):
         return calibrated(_places(run, progress), names, poses), None
-    motion = _motion(run, poses, names, progress)
+    most = None if from_motion else _MOST_TURNS
+    motion = _motion(run, poses, names, progress, most)
     offset_s = -np.nan_to_num([pose.late_s for pose in motion.poses]) if time_offset else zeros
     if np.abs(offset_s).max() > _LATE_S:
         # Windows with the same motion of all lidars.
         offset_ns = {name: round(s * NS_PER_S) for name, s in zip(names, offset_s, strict=True)}
         job = replace(job, selection=replace(job.selection, offset_ns=offset_ns))
-        motion = _motion(Conversion(job), poses, names, progress)
+        motion = _motion(Conversion(job), poses, names, progress, most)
     else:
         offset_s = zeros
     if from_motion and motion.refusal:
@@ -276,7 +277,7 @@ def _motion(
     poses: Sequence[F64Array],
     names: Sequence[str],
     progress: Progress | None,
-    most: int | None = None,
+    most: int | None,
 ) -> MotionPoses:
     """The motion of some lidars, the first ones of a run, in all or `most` windows."""
     with contextlib.closing(_scans(run, progress)) as scans:
