@@ -43,7 +43,7 @@ from mlbatch.errors import ClockError, RecordingError, RigError, UsageError
 from mlbatch.frames.tree import FrameTree, clean, some
 from mlbatch.lidar.interface import Calibration
 from mlbatch.rig.rig import Rig, RigSensor, StreamSelector, read_rig
-from mlbatch.types import Recording, Stream, StreamTable, WrappedRecording
+from mlbatch.types import Recording, Stream, StreamTable
 from mlbatch.units import NS_PER_S
 
 if TYPE_CHECKING:
@@ -275,16 +275,9 @@ def discover(
 
 def _output_of(recordings: Sequence[Recording]) -> OutputRecording | None:
     """The output of `convert` that is batched again, None for recordings."""
-    wrapped = recordings[0] if recordings else None
-    if not isinstance(wrapped, WrappedRecording):
-        return None
-    # Not loaded for recordings.
-    from mlbatch.outputs.recording import OutputRecording
-
-    # Segments of a recording wrap it.
-    while isinstance(wrapped, WrappedRecording) and not isinstance(wrapped, OutputRecording):
-        wrapped = wrapped.inner
-    return wrapped if isinstance(wrapped, OutputRecording) else None
+    # Segments of it have what they wrap.
+    found: OutputRecording | None = getattr(recordings[0], "as_output", None)
+    return found
 
 
 def _match_output(sampler: Sampler, output: OutputRecording) -> Matched:

@@ -22,7 +22,7 @@ from mlbatch.outputs.encoding import MessageCursor
 from mlbatch.outputs.folders import ScanFile, ScanReader, scan_files
 from mlbatch.outputs.kinds import FileFormat, Kind, format_of, kind_of
 from mlbatch.outputs.metadata import RunMetadata, metadata_of_grid
-from mlbatch.outputs.run_files import PIECES, RunFiles, inner_texts, mcaps_of
+from mlbatch.outputs.run_files import PIECES, RunFiles, inner_texts
 from mlbatch.outputs.scan import Scan
 from mlbatch.outputs.stored_scan import StoredScan
 from mlbatch.outputs.table import UNKNOWN, ScanRow, TableOfRun, read_table
@@ -174,18 +174,6 @@ class MessageScans:
         # Topics of scans, with the only sensor of each.
         self.topics: dict[str, int | None] = {"/points": None}
         self.topics |= {f"/{name}/points": i for i, name in enumerate(run.sensors)}
-
-    @classmethod
-    def of_output(cls, path: Path) -> MessageScans:
-        """Those of an MCAP file or a bag."""
-        mcaps = mcaps_of(path)
-        if not mcaps:
-            return cls(path, _run_of_bag(path))
-        from mlbatch.outputs.mcap_file import McapFile
-
-        log = CheckLog()
-        file = McapFile(log, mcaps[0], mcaps[0].name)
-        return cls(path, _run_of_mcap(log, path, mcaps[0], file))
 
     def scan(self, message: Message, number: int | None = None) -> Scan | None:
         """The scan in a message, None for other messages; number: of the scan, None: the next."""

@@ -9,7 +9,7 @@ states its own time. Receive times are those of the columns, so that all lidars 
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Generator, Iterable, Iterator
+from collections.abc import Generator, Iterator
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -22,9 +22,8 @@ from mlbatch.arrays import U8Array
 from mlbatch.batching.windows import Coverage
 from mlbatch.errors import RecordingError
 from mlbatch.lidar.interface import Evidence, Lidar
-from mlbatch.outputs import containers
 from mlbatch.outputs.kinds import kind_of
-from mlbatch.outputs.read import MessageScans, read
+from mlbatch.outputs.read import read
 from mlbatch.outputs.run_files import RunFiles
 from mlbatch.outputs.scan import Scan
 from mlbatch.readers import open_recording
@@ -32,7 +31,7 @@ from mlbatch.report.report import RunReport, report_of
 from mlbatch.rig.rig import Rig, RigSensor, StreamSelector
 from mlbatch.ros.point_packets import HEAD, Layout, Points, layout_of, pack
 from mlbatch.types import (
-    Message,
+    CaptureCounts,
     PacketBatch,
     Recording,
     Stream,
@@ -53,40 +52,34 @@ class OutputRecording(WrappedRecording):
     """The scans of an output as packets, and its messages.
 
     rig: lidars, body frame and rate of its run; lidars: in the same order; timescale: of all
-    times; coverage: what the scans of the current pass cover, None with partial windows.
+    times; coverage: what the scans of the current pass cover; has_partial: with partial windows.
     """
 
     __slots__ = (
-        *("coverage", "lidars", "path", "rig", "timescale", "topics"),
-        *("_files", "_layouts", "_left_out", "_messages", "_streams"),
+        *("coverage", "has_partial", "lidars", "path", "rig", "timescale", "topics"),
+        *("_layouts", "_left_out", "_scans", "_streams"),
     )
 
     def __init__(self, path: Path, streams: StreamTable) -> None:
-        kind = kind_of(path)
-        self._files = 0
-        if kind.form is None:
+        form = kind_of(path).form
+        if form is None:
             super().__init__(open_recording(path, streams))
-            self._messages: MessageScans | None = MessageScans.of_output(path)
         else:
             files = [one for one in (path, *path.rglob("*")) if one.is_file()]
-            self._files = len(files)
             size_bytes = sum(one.stat().st_size for one in files)
-            super().__init__(Recording(path, kind.form.name, size_bytes))
-            self._messages = None
+            super().__init__(Recording(path, form.name, size_bytes))
         self.path = path
-        names = {} if self._messages is None else self._messages.topics
-        self.topics = tuple(topic for topic in self.inner.topics if topic.name not in names)
-        self._layouts: dict[int, Layout] = {}
-        self._streams: list[int] = []
-        self.coverage: Coverage | None = Coverage()
-        text = RunFiles.of(path).texts()[0]
+        self.coverage = Coverage()
+        text, table = RunFiles.of(path).texts()
         report = None if text is None else report_of(path, text)
-        if report is None or (report.identity or {}).get("keep partial") == "True":
-            self.coverage = None
+        self._scans = 0 if table is None else table.count("\n") - 1
+        self.has_partial = report is None or (report.identity or {}).get("keep partial") == "True"
         self._left_out = "" if report is None else _left_out(report)
         first = self._first()
         self._refuse(first)
         info = first.info
+        scans = {"/points", *(f"/{one.name}/points" for one in info.sensors)}
+        self.topics = tuple(topic for topic in self.inner.topics if topic.name not in scans)
         self.timescale = info.timescale
         selectors = [StreamSelector(topic=f"/{one.name}/points") for one in info.sensors]
         self._streams = [streams.number(Stream(topic=one.topic)) for one in selectors]
@@ -99,7 +92,12 @@ class OutputRecording(WrappedRecording):
             first.frame_id,
             parse_rate(info.rate_hz),
         )
-        self._choose_layouts(first, len(info.sensors))
+        found = {number: layout_of(points, 0).slots for number, points in self._points(first)}
+        most = max(found.values(), default=1)
+        self._layouts = [
+            Layout(0, found.get(number, most), has_labels=True)
+            for number in range(len(info.sensors))
+        ]
         self.lidars = []
         for number, one in enumerate(info.sensors):
             lidar = _lidar(self._layouts[number], selectors[number].topic)
@@ -107,6 +105,11 @@ class OutputRecording(WrappedRecording):
             lidar.mode = f"scans at {info.rate_hz} Hz"
             lidar.calibration = str(path)
             self.lidars.append(lidar)
+
+    @property
+    def as_output(self) -> OutputRecording:
+        """Itself, also for recordings that wrap it."""
+        return self
 
     def describe(self) -> str:
         """How the output is read, in a line."""
@@ -121,52 +124,41 @@ class OutputRecording(WrappedRecording):
 
     def packets(self) -> Generator[PacketBatch, None, None]:
         """Yield the columns of all scans, and the messages to keep; each call is a new pass."""
-        if self.coverage is not None:
-            self.coverage.begin()
-        with contextlib.closing(self._parts()) as parts:
-            for batch, scans in parts:
-                if batch is not None and batch.messages:
-                    yield batch
-                for scan in scans:
-                    if self.coverage is not None:
-                        self.coverage.add(scan.start_ns, scan.end_ns, is_complete=scan.complete)
-                    packets = self._packets(scan)
-                    self.inner.counts.frames += len(packets)
-                    self.inner.counts.datagrams += len(packets)
-                    yield packets
-
-    def _parts(self) -> Generator[tuple[PacketBatch | None, Iterator[Scan]], None, None]:
-        """Batches of the container without packets, each with its scans."""
-        if self._messages is None:
-            self.inner.position_bytes = 0
-            self.inner.counts = type(self.inner.counts)()
+        self.coverage.begin()
+        self.inner.counts = CaptureCounts()
+        with contextlib.closing(self._messages()) as messages:
+            waiting = next(messages, None)
             for number, scan in enumerate(read(self.path, by_window=True), 1):
-                done = min(number, self._files)
-                self.inner.position_bytes = self.size_bytes * done // self._files
-                yield None, iter((scan,))
-            return
-        names = frozenset(self._messages.topics)
-        self.inner.keep = self.keep | names
-        self.inner.lend = names - self.keep
-        batches = self.inner.packets()
-        try:
-            for batch in batches:
-                kept = tuple(one for one in batch.messages if one.topic.name in self.keep)
-                others = (one for one in batch.messages if one.topic.name in names)
-                empty = replace(batch.take(slice(0, 0)), messages=kept)
-                yield empty, _scans_of(self._messages, others)
-        finally:
-            batches.close()
+                while waiting is not None and waiting.messages[0].host_ns < scan.end_ns:
+                    yield waiting
+                    waiting = next(messages, None)
+                self.coverage.add(scan.start_ns, scan.end_ns, is_complete=scan.complete)
+                packets = self._packets(scan)
+                self.inner.counts.frames += len(packets)
+                self.inner.counts.datagrams += len(packets)
+                if self._scans:
+                    self.inner.position_bytes = self.size_bytes * number // self._scans
+                yield packets
+            if waiting is not None:
+                yield waiting
+            yield from messages
+
+    def _messages(self) -> Generator[PacketBatch, None, None]:
+        """Batches of messages to keep, without packets."""
+        if self.keep:
+            self.inner.keep = self.keep
+            with contextlib.closing(self.inner.packets()) as batches:
+                for batch in batches:
+                    if batch.messages:
+                        yield replace(batch.take(slice(0, 0)), messages=batch.messages)
 
     def _first(self) -> Scan:
         """The first scan with points, else the first one; RecordingError without any."""
         empty: Scan | None = None
-        with contextlib.closing(self._parts()) as parts:
-            for _, scans in parts:
-                for scan in scans:
-                    if scan.point_count:
-                        return scan
-                    empty = empty or scan
+        for scan in read(self.path, by_window=True):
+            if scan.point_count:
+                return scan
+            empty = empty or scan
         if empty is None:
             raise RecordingError(f"{self.path}: expected scans, found none; convert again")
         return empty
@@ -197,17 +189,6 @@ class OutputRecording(WrappedRecording):
                 f"without {', '.join(missing)}; give the recording that was converted, or convert "
                 "it to npz or a message with the point layout standard"
             )
-
-    def _choose_layouts(self, scan: Scan, lidars: int) -> None:
-        """Choose the slots of the packets of each lidar, by a scan."""
-        found = {
-            number: layout_of(replace(points, ring=None), 0)
-            for number, points in self._points(scan)
-        }
-        most = max((one.slots for one in found.values()), default=1)
-        for number in range(lidars):
-            slots = found[number].slots if number in found else most
-            self._layouts[number] = Layout(0, slots, has_labels=True)
 
     def _points(self, scan: Scan) -> Iterator[tuple[int, Points]]:
         """The points of each lidar that has some; rings are in their labels."""
@@ -279,17 +260,6 @@ def _lidar(layout: Layout, topic: str) -> Lidar:
     calibrations = sensors.built_in(set(sensors.senders(layout.size, sample)))
     best = max(calibrations, key=lambda calibration: calibration.match_score(evidence))
     return best.lidar({}, evidence)
-
-
-def _scans_of(scans: MessageScans, messages: Iterable[Message]) -> Iterator[Scan]:
-    for message in messages:
-        topic = message.topic
-        own = containers.Message(
-            topic.name, topic.name, topic.type, topic.encoding, message.host_ns, 0, message.data
-        )
-        scan = scans.scan(own)
-        if scan is not None:
-            yield scan
 
 
 def _left_out(report: RunReport) -> str:

@@ -147,7 +147,7 @@ class Conversion:
                 job.keep_partial or job.is_fused,
                 job.start,
                 job.end,
-                None if output is None else output.coverage,
+                None if output is None or output.has_partial else output.coverage,
                 # Of a part of a session, other parts may have whole windows.
                 job.shard is None and job.segment == TimeSegment(),
             ),
