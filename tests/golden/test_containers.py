@@ -28,7 +28,7 @@ from tests.builders.captures import (
     section_bytes,
     write_pcapng,
 )
-from tests.builders.run import FIXTURE, RECORDINGS, ROOT, Values, command, in_memory, prints
+from tests.builders.run import FIXTURE, RECORDINGS, ROOT, Values, in_memory, prints
 from tests.builders.sessions_of_bags import CONTAINERS, edited_copy
 from tests.builders.traffic import datagrams_of, read_pcap
 from tests.matrix.cells import plain
@@ -182,27 +182,7 @@ def real_bag(name: str) -> Path:
 
 
 @pytest.mark.parametrize("name", BAGS)
-def test_every_packet_of_a_real_bag_is_counted(name: str) -> None:
-    topic, packets, size = BAGS[name]
-    folder = real_bag(name)
-    assert packets_of(folder) == {(topic, size): packets}
-    (file,) = folder.glob("*.db3")
-    assert packets_of(file) == {(topic, size): packets}
-
-
-@pytest.mark.parametrize("name", BAGS)
 def test_bags_that_do_not_name_their_storage_are_read(name: str, tmp_path: Path) -> None:
     topic, packets, size = BAGS[name]
     copy = edited_copy(real_bag(name), tmp_path / "copy")
     assert packets_of(copy) == {(topic, size): packets}
-
-
-@pytest.mark.parametrize("name", BAGS)
-def test_inspect_shows_the_stream_of_a_real_bag(name: str) -> None:
-    topic, packets, _ = BAGS[name]
-    outcome = command("inspect", real_bag(name))
-    assert (outcome.code, outcome.err) == (0, "")
-    row = next(line for line in outcome.out.splitlines() if line.startswith(topic))
-    assert str(packets) in row.split()
-    vendor = name.split("/", maxsplit=1)[0]
-    assert vendor in row.lower() or "pandar" in row.lower()

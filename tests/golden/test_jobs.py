@@ -84,11 +84,11 @@ class Nth:
             raise self._error
 
 
-# What fails in a stage, and what is said of it.
-STAGES: dict[str, tuple[BaseException, str]] = {
-    "decode": (PacketError("spoilt"), "spoilt"),
-    "compress": (MemoryError(), "out of memory"),
-    "write": (OSError(28, "No space left on device"), "No space left on device"),
+# What fails in a stage, how, and what is said of it.
+STAGES: dict[str, tuple[object, str, BaseException, str]] = {
+    "decode": (Decoder, "scan", PacketError("spoilt"), "spoilt"),
+    "compress": (Chunk, "compress", MemoryError(), "out of memory"),
+    "write": (output_file, "write_all", OSError(28, "No space left"), "No space left"),
 }
 
 
@@ -99,30 +99,15 @@ def test_an_error_of_any_stage_ends_the_run(
     recordings: Path, stage: str, jobs: int, number: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(_place(recordings, f"{stage} {jobs} {number}"))
-    error, message = STAGES[stage]
+    place, name, error, message = STAGES[stage]
     nth = Nth(number, error)
-    scan = Decoder.scan
-    compress = Chunk.compress
-    write_all = output_file.write_all
+    call = getattr(place, name)
 
-    def failing_scan(*given: object) -> object:
+    def failing(*given: object) -> object:
         nth.call()
-        return scan(*given)  # type: ignore[arg-type]
+        return call(*given)
 
-    def failing_compress(*given: object) -> None:
-        nth.call()
-        compress(*given)  # type: ignore[arg-type]
-
-    def failing_write(*given: object) -> None:
-        nth.call()
-        write_all(*given)  # type: ignore[arg-type]
-
-    if stage == "decode":
-        monkeypatch.setattr(Decoder, "scan", failing_scan)
-    elif stage == "compress":
-        monkeypatch.setattr(Chunk, "compress", failing_compress)
-    else:
-        monkeypatch.setattr(output_file, "write_all", failing_write)
+    monkeypatch.setattr(place, name, failing)
     outcome = command(*_words("mcap", "--jobs", str(jobs)))
     assert outcome.code == 1
     assert outcome.err.count("\n") == 1

@@ -1,4 +1,7 @@
-"""`--resume`: messages, refused jobs, files left by runs that end early."""
+"""`--resume`: messages, refused jobs, files left by runs that end early.
+
+Signals at any moment: `tests/golden/test_resume.py`.
+"""
 
 from __future__ import annotations
 
@@ -129,25 +132,6 @@ def test_the_head_and_slices_are_not_made_again(shell: Shell) -> None:
     outcome = shell(f"convert {words} -o out --resume")
     assert outcome.err == "mlbatch: out: resumed after 3 scans\n"
     assert contents(Path()) == whole
-
-
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
-def test_a_request_to_end_is_an_interrupt(
-    shell: Shell, monkeypatch: pytest.MonkeyPatch, number: signal.Signals
-) -> None:
-    before = signal.signal(number, signal.SIG_DFL)
-    encode = npz.NpzEncoder.encode
-
-    def ending(encoder: npz.NpzEncoder, scan: Scan) -> list[Bytes]:
-        if scan.index == 1:
-            signal.raise_signal(number)
-        return encode(encoder, scan)
-
-    monkeypatch.setattr(npz.NpzEncoder, "encode", ending)
-    assert shell(f"convert {CAPTURE} -o out").code == 130
-    assert signal.signal(number, before) is signal.SIG_DFL
-    # Other threads complete what they have begun.
-    assert len(JOURNAL.read_bytes().splitlines()) >= 2
 
 
 def test_nohup_outlives_its_terminal(shell: Shell, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -612,27 +596,6 @@ def test_no_change_of_a_byte_gives_another_scan(shell: Shell) -> None:
             found = [one for _, one in files.records(JOURNAL)]
             assert all(one in said.values() for one in found)
             assert 1 <= len(found) <= 3
-
-
-def test_no_change_of_a_byte_gives_another_output(shell: Shell) -> None:
-    """The same to the end, for bytes of all lines."""
-    whole = _whole(shell)
-    _interrupt(shell)
-    Path("out.partial").rename("kept")
-    content = Path("kept/files.jsonl").read_bytes()
-    after = set()
-    for at in range(3, len(content), len(content) // 40):
-        shutil.rmtree("out", ignore_errors=True)
-        shutil.copytree("kept", "out.partial")
-        JOURNAL.write_bytes(content[:at] + bytes([content[at] ^ 4]) + content[at + 1 :])
-        outcome = shell(f"convert {CAPTURE} -o out --resume")
-        after.add(outcome.err.splitlines()[-1])
-        assert outcome.code == 0
-        assert contents(Path()) == whole
-    assert after == {
-        "mlbatch: out: nothing to resume; started over",
-        "mlbatch: out: resumed after 2 scans",
-    }
 
 
 def test_a_full_disk_names_the_remedy(shell: Shell, monkeypatch: pytest.MonkeyPatch) -> None:
