@@ -20,7 +20,7 @@ TWO = ROOT / "fixtures" / "two_lidars"
 FOUR = ROOT / "fixtures" / "four_makers"
 MOVING = ROOT / "fixtures" / "moving"
 # Of float32 seconds below 0.125, and of float64 seconds since 1970.
-STEP_NS = {"scans.mcap": 8, "scans.bag": 8, "bag": 8, "pcd": 8, "hesai.mcap": 300}
+STEP_NS = {"scans.mcap": 8, "end.mcap": 8, "scans.bag": 8, "bag": 8, "pcd": 8, "hesai.mcap": 300}
 KINDS: dict[str, dict[str, Any]] = {
     "scans.mcap": {},
     "scans.bag": {},
@@ -30,6 +30,7 @@ KINDS: dict[str, dict[str, Any]] = {
     "pcd": {"format": "pcd"},
     "organized": {"format": "npz", "layout": "organized"},
     "hesai.mcap": {"point_layout": "hesai", "split": True},
+    "end.mcap": {"stamp": "end"},
 }
 
 
