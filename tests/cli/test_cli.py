@@ -37,7 +37,7 @@ def without_timing(report: Report) -> Report:
 def test_a_run_prints_a_summary_and_nothing_else(shell: Shell) -> None:
     outcome = shell(f"convert {FIX} -o out")
     assert (outcome.code, outcome.err) == (0, "")
-    head, left, right, scans, first, speed, wrote = outcome.out.splitlines()
+    head, left, right, scans, first, speed, wrote, look = outcome.out.splitlines()
     assert head.split() == [
         "sensor",
         "model",
@@ -58,6 +58,7 @@ def test_a_run_prints_a_summary_and_nothing_else(shell: Shell) -> None:
     assert first == "first scan at 2026-05-04T08:00:00.100Z"
     assert speed.startswith("0.8 s recorded in ")
     assert wrote == "wrote out, report out/report.json"
+    assert look == "mlbatch report out makes the page, mlbatch view out plays the scans"
 
 
 def test_quiet_prints_nothing_and_verbose_more(shell: Shell) -> None:
