@@ -8,7 +8,7 @@ distributions transform: P. Biber, W. Strasser, 2003), with the robust kernel of
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -33,8 +33,7 @@ _MOST_RESIDUAL_M = 0.1
 _DIGITS = 6
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Pose:
+class Pose(NamedTuple):
     """A rigid transform: rotation (3, 3), position_m (3,)."""
 
     rotation: F64Array
@@ -60,8 +59,7 @@ class Pose:
 ORIGIN = Pose(np.eye(3), np.zeros(3))
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class ColumnCloud:
+class ColumnCloud(NamedTuple):
     """Points (n, 3) of a window in the body frame, m, as measured.
 
     column: (n,), index into time_s; time_s: (c,) of the columns, from the middle of the window.
@@ -90,8 +88,7 @@ class ColumnCloud:
         return moved
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Registration:
+class Registration(NamedTuple):
     """Outcome of a registration.
 
     pose: map_from_body at the middle of the window; velocity: (6,), twist a second; residual_m:

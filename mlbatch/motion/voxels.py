@@ -9,7 +9,7 @@ voxel, and across stems that are alone.
 from __future__ import annotations
 
 from collections import deque
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -64,8 +64,7 @@ def first_in_voxels(points_m: F64Array, edge_m: float) -> I64Array:
     return np.sort(np.unique(voxel_keys(points_m, edge_m), return_index=True)[1])
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Sums:
+class _Sums(NamedTuple):
     """Sums over the points of each voxel: key (k,), and count, x, y, z, xx, xy, xz, yy, yz, zz.
 
     Coordinates count from the centre of the voxel.
@@ -85,8 +84,7 @@ class _Sums:
         return cls(ordered[first], np.add.reduceat(values[order], first, axis=0))
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Distributions:
+class Distributions(NamedTuple):
     """Planes and stems of k voxels.
 
     key: (k,), increasing; mean_m: (k, 3); whiten: (k, 3, 3), rows are the directions across them,

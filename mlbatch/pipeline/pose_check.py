@@ -23,8 +23,9 @@ if TYPE_CHECKING:
     from mlbatch.batching.windows import Window
     from mlbatch.poses.check import PoseComparison
 
-# Of a lidar in a window; of more, every second column is read, or every third.
-_SLOTS = 1 << 15
+# Of a lidar in a window, and where few surfaces match; of more, every second column is read, or
+# every third.
+_SLOTS, _MORE_SLOTS = 1 << 14, 1 << 15
 # Points (n, 3) of a window or slice, their times (n,) in ns, their lidars (n,).
 _Points: TypeAlias = tuple[F32Array, I64Array, U8Array]
 # Nearer points are of the machine, farther ones too sparse to show surfaces.
@@ -88,10 +89,12 @@ class PoseCheck:
     def _points(self, window: Window) -> _Points:
         """Points of some columns; columns of a sensor are taken at equal steps."""
         columns = window.columns
+        needs_all = self._comparison is not None and self._comparison.needs_all
+        most = _MORE_SLOTS if needs_all else _SLOTS
         taken: list[I64Array] = []
         for number, slots in enumerate(self._slots):
             rows = np.flatnonzero(columns.sensor == number)
-            step = max(1, -(-len(rows) * slots * self._slices // _SLOTS))
+            step = max(1, round(len(rows) * slots * self._slices / most))
             taken.append(rows[::step])
         some = columns.take(np.sort(np.concatenate(taken)))
         if self._decoder is None:
@@ -124,7 +127,9 @@ class PoseCheck:
                 away_m = points_m[own] - origin_m.astype(np.float32)
                 squared = np.einsum("ni,ni->n", away_m, away_m)
                 rows = own[(squared > _NEAREST_M**2) & (squared < _FARTHEST_M**2)]
-                clouds.append(Cloud(number, points_m[rows], time_s[rows], origin_m))
+                clouds.append(
+                    Cloud(number, points_m[rows].astype(np.float64), time_s[rows], origin_m)
+                )
         self._comparison.add(clouds)
         self._is_over = self._comparison.is_settled
 

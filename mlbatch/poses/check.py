@@ -1,16 +1,16 @@
 """Whether the surfaces that two lidars see fit, with the poses of a run.
 
-Each place, two windows that follow each other, gives an estimate of the corrections that the poses
-need, with its covariance; all are joined by their weights, and what they differ
-more than expected counts as uncertainty (Birge ratio). A residual is proven only where several
-places agree on it.
+Distances between surfaces in all places, two windows that follow each other each, give one estimate
+of the corrections that the poses need, with its covariance. A residual is proven only if it
+stays without any single place.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import combinations
+from typing import NamedTuple
 
 import numpy as np
 
@@ -22,6 +22,7 @@ from mlbatch.poses.solve import (
     Level,
     Place,
     Problem,
+    Rows,
     Solution,
     State,
     estimate,
@@ -30,6 +31,8 @@ from mlbatch.poses.solve import (
 from mlbatch.poses.surfaces import Planes, shared_cells
 from mlbatch.report.poses import (
     EXCHANGED,
+    LIMIT_DEG,
+    LIMIT_MM,
     MEASURED,
     MISFIT,
     NOT_CHECKED,
@@ -38,9 +41,11 @@ from mlbatch.report.poses import (
     PairFigures,
 )
 
-# A wrong pose: a residual above these is a warning.
-LIMIT_M = 0.03
-LIMIT_RAD = float(np.deg2rad(0.3))
+LIMIT_M = LIMIT_MM / 1000.0
+LIMIT_RAD = float(np.deg2rad(LIMIT_DEG))
+# Beyond these, surfaces are matched with others, and figures are chance.
+_MOST_M = 0.4
+_MOST_RAD = float(np.deg2rad(3.0))
 # Standard deviations by which it has to be above, and of what is determined at all.
 _PROOF = 4.0
 _MOST_SIGMA_M = 0.015
@@ -52,11 +57,13 @@ _MOST_PLACES = 6
 _CLEAR_PLACES = 2
 # Places that are kept, to try other poses on.
 _KEPT = 3
-# Points of a cloud that are used, and where few surfaces are matched, all.
-_POINTS = 11_000
+# Where fewer distances were matched in a place, more points and sizes of cells are used.
 _FEW_SURFACES = 40
 # Directions that planes do not determine, from which on stems are looked for.
 _WEAK = 2
+# Surfaces in common in a place, and distances between two lidars, that are chance.
+_STRAY = 3
+_CHANCE = 12
 # Surfaces in common below which nothing is said, and the share of them that fits with good poses.
 _LEAST_SURFACES = 12
 _MISFIT = 0.5
@@ -64,12 +71,15 @@ _FITS = 0.8
 # Turns by which what is 10 m away moves as far, as in `solve`.
 _LEVER_M = 10.0
 _SCALE = np.array([1.0, 1.0, 1.0, _LEVER_M, _LEVER_M, _LEVER_M])
-# Of directions that a place does not determine, m2.
-_UNKNOWN_M2 = 1e4
 # What is not modelled: standard deviations are never smaller.
 _FLOOR_M = 0.001
 _FLOOR_RAD = float(np.deg2rad(0.005))
-_COARSE, _MIDDLE, _FINE = LEVELS
+_COARSE, _MIDDLE, _ = LEVELS
+# How surfaces are matched, and where few are: in cells of three sizes.
+_LIGHT = (_MIDDLE, 0)
+_RICH = (Level(0.25, _MIDDLE.parallel, _MIDDLE.most_m, doubled=2), 2)
+# How often surfaces of a place are matched, with the motion so far.
+_MOST_MATCHES = 3
 # Motion between windows, in about this time, beyond which one step is too little, m.
 _BETWEEN_S = 0.1
 _FAST_M = 0.05
@@ -80,24 +90,7 @@ _STEPS = 8
 _ALONG_AXIS = 0.9
 
 
-class _Watched(Problem):
-    """A problem that keeps the planes that it was first asked for."""
-
-    def __init__(self, place: Place, lidars: int) -> None:
-        super().__init__([place], lidars)
-        self.first: list[Planes] = []
-
-    def _planes(self, place: int, state: State, level: Level) -> list[list[Planes]]:
-        found = super()._planes(place, state, level)
-        self.first = self.first or [sizes[0] for sizes in found]
-        return found
-
-    def start(self) -> State:
-        """Poses as converted, at rest."""
-        return State.start(self.lidars, 1)
-
-
-@dataclass(slots=True)
+@dataclass(eq=False, repr=False)
 class _Pair:
     """Surfaces of two lidars in all places: in both, in the one that has fewer, that fit."""
 
@@ -117,16 +110,13 @@ class _Pair:
         self.fit += int(np.count_nonzero(fits))
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Estimate:
-    """Corrections (u,) of a place or all, six of each lidar but the first, turns by `_LEVER_M`.
-
-    covariance, information: (u, u).
-    """
+class _Estimate(NamedTuple):
+    """Corrections (u,), six of each lidar but the first, turns by `_LEVER_M`; covariance: (u, u);
+    weak: number of directions that are not determined."""
 
     value: F64Array
     covariance: F64Array
-    information: F64Array
+    weak: int
 
 
 class PoseComparison:
@@ -144,18 +134,25 @@ class PoseComparison:
 
         as_radians: poses if angles were meant as radians, where they may have been.
         """
-        self.places = 0
         self._names = names
         self._poses = body_from_sensor
         self._as_radians = as_radians
         self._tries_others = tries_others
         self._pairs = {pair: _Pair() for pair in combinations(range(len(names)), 2)}
-        self._estimates: list[_Estimate] = []
-        # Of places where something seems to be off.
-        self._kept: list[Place] = []
+        self._places: list[Place] = []
+        self._rows: list[Rows] = []
+        # Corrections and twists that the rows were matched with.
+        self._state = State.start(len(names), 0)
+        self._joined: _Estimate | None = None
+        self._is_misfit = False
         # Whether planes of some points were too little.
         self._needs_stems = False
-        self._needs_all = False
+        self.needs_all = False
+
+    @property
+    def places(self) -> int:
+        """Places so far."""
+        return len(self._rows)
 
     @property
     def is_settled(self) -> bool:
@@ -165,49 +162,66 @@ class PoseComparison:
         if self.places >= _MOST_PLACES:
             return True
         pairs = self._measured()
-        if not any(pair.surfaces for pair in pairs):
+        if all(pair.surfaces <= _STRAY * self.places for pair in pairs):
             return True
-        return all(map(self._is_clear, pairs))
+        return all(map(self._is_clear, pairs)) and not any(
+            pair.undetermined and not pair.is_wrong for pair in pairs
+        )
 
     def add(self, place: Place) -> None:
         """Compare the clouds of a place: a cloud of each lidar in a window, then in the next."""
-        self.places += 1
-        few = [self._reduced(cloud) for cloud in place]
-        problem, solution = self._solved(few)
-        # Where nothing is in common, stems would add nothing either.
-        is_open = _across(solution) and solution.weak.shape[1] >= _WEAK
-        if is_open and not self._needs_stems:
+        state = State.start(len(self._names), 1)
+        # A vehicle hardly changes its velocity from place to place.
+        state.twists[:] = self._state.twists[-1:] if self.places else 0.0
+        self._places.append(self._used(place))
+        self._rows.append(self._matched(self._places[-1], state, counts=True))
+        self._state.twists = np.vstack([self._state.twists, state.twists])
+        self._joined = None
+        across = _across(self._rows[-1])
+        if across <= _CHANCE:
+            # Nothing is in common; stems would add nothing either.
+            return
+        self._joined = self._estimate()
+        if self._joined.weak >= _WEAK and not self._needs_stems:
             self._needs_stems = True
-            problem, solution = self._solved([self._reduced(cloud) for cloud in place])
-        misfit = self._count(problem.first)
-        if not self._needs_all and 0 < _across(solution) < _FEW_SURFACES:
-            self._needs_all = True
-            problem, solution = self._solved([self._reduced(cloud) for cloud in place])
-        found = _estimate(solution)
-        is_off = misfit or (found is not None and _seems_off(found))
-        if is_off or found is None:
-            self._kept = [*self._kept, place][-_KEPT:]
-        if is_off:
-            state = solve(problem, problem.start(), _COARSE, _STEPS).state
-            found = _estimate(solve(problem, state, _MIDDLE, _STEPS))
-        if found is not None:
-            self._estimates.append(found)
+            self._places[-1] = self._used(place)
+            self._rows[-1] = self._matched(self._places[-1], state)
+            self._joined = self._estimate()
+        self.needs_all |= across < _FEW_SURFACES
 
-    def _reduced(self, cloud: Cloud) -> Cloud:
-        """What is used of a cloud: as much as the places so far needed."""
-        step = 1 if self._needs_all else max(1, len(cloud.points_m) // _POINTS)
-        origin_m = cloud.origin_m if self._needs_stems else None
-        points_m = cloud.points_m[::step].astype(np.float64)
-        return Cloud(cloud.lidar, points_m, cloud.time_s[::step], origin_m)
+    def _used(self, place: Place) -> Place:
+        """A place with what is needed of it."""
+        return place if self._needs_stems else [replace(one, origin_m=None) for one in place]
 
-    def _solved(self, place: Place) -> tuple[_Watched, Solution]:
-        """Corrections by one step, or where the machine is fast by more."""
-        level = _FINE if self._needs_all else _MIDDLE
-        problem = _Watched(place, len(self._names))
-        solution = estimate(problem, problem.start(), level)
-        if float(np.abs(solution.state.twists).max(initial=0.0)) * _BETWEEN_S > _FAST_M:
-            solution = solve(problem, solution.state, level, most_steps=2)
-        return problem, solution
+    @property
+    def _level(self) -> tuple[Level, int]:
+        """How surfaces are matched, and which size of cells is counted."""
+        return _RICH if self.needs_all else _LIGHT
+
+    def _matched(self, place: Place, state: State, *, counts: bool = False) -> Rows:
+        """Match the surfaces of a place, with a motion that is put into the state."""
+        problem = Problem([place], len(self._names))
+        level, counted = self._level
+        for attempt in range(_MOST_MATCHES):
+            surfaces = problem.planes(0, state, level)
+            rows = problem.place_rows(0, state, level, surfaces)
+            if counts and not attempt:
+                self._is_misfit |= self._count([sizes[counted] for sizes in surfaces])
+            if _across(rows) <= _CHANCE:
+                break
+            twists = estimate(problem, [rows], state).state.twists
+            if float(np.abs(twists - state.twists).max(initial=0.0)) * _BETWEEN_S <= _FAST_M:
+                break
+            state.twists = twists
+        return rows
+
+    def _estimate(self, without: int | None = None) -> _Estimate:
+        """The corrections by all places, or by all but one."""
+        used = [number for number in range(self.places) if number != without]
+        state = replace(self._state, twists=self._state.twists[used])
+        rows = [self._rows[number] for number in used]
+        problem = Problem([], len(self._names))
+        return _estimate(estimate(problem, rows, state, most_sigma_m=_MOST_SIGMA_M))
 
     def _count(self, surfaces: Sequence[Planes]) -> bool:
         """Count the surfaces of the first window; return whether a pair's do not fit."""
@@ -222,10 +236,22 @@ class PoseComparison:
 
     def figures(self) -> tuple[PairFigures, ...]:
         """What is known of each pair."""
+        self._rematch()
         found = self._measured()
         if not self._tries_others:
             return found
         return tuple(map(self._with_cause, self._pairs, found))
+
+    def _rematch(self) -> None:
+        """Match surfaces anew where something seems to be off: one linear step may be too short."""
+        if self._joined is None or not (self._is_misfit or _seems_off(self._joined)):
+            return
+        problem, level = Problem(self._places, len(self._names)), self._level[0]
+        if self._is_misfit:
+            self._state = solve(problem, self._state, _COARSE, _STEPS).state
+        self._state = solve(problem, self._state, level, _STEPS).state
+        self._rows = problem.rows(self._state, level)
+        self._joined = self._estimate()
 
     def _with_cause(self, key: tuple[int, int], pair: PairFigures) -> PairFigures:
         """Figures with the mistake that explains them, if one does."""
@@ -241,8 +267,9 @@ class PoseComparison:
         return pair
 
     def _measured(self) -> tuple[PairFigures, ...]:
-        joined = _joined(self._estimates)
-        return tuple(self._figures(key, pair, joined) for key, pair in self._pairs.items())
+        if self._joined is None and self.places:
+            self._joined = self._estimate()
+        return tuple(self._figures(key, pair) for key, pair in self._pairs.items())
 
     @staticmethod
     def _is_clear(pair: PairFigures) -> bool:
@@ -254,7 +281,8 @@ class PoseComparison:
         turn_deg = (pair.turn_deg or 0.0) + _PROOF * (pair.turn_deviation_deg or 0.0)
         return shift_m <= LIMIT_M and np.deg2rad(turn_deg) <= LIMIT_RAD
 
-    def _figures(self, key: tuple[int, int], pair: _Pair, joined: _Estimate | None) -> PairFigures:
+    def _figures(self, key: tuple[int, int], pair: _Pair) -> PairFigures:
+        joined = self._joined
         names = self._names[key[0]], self._names[key[1]]
         if not pair.both:
             return PairFigures(names, NOT_CHECKED, "the lidars see nothing in common")
@@ -277,6 +305,8 @@ class PoseComparison:
         if shift.size is None and turn.size is None:
             return figures._replace(reason="what they see in common determines no direction")
         is_off = shift.is_proven or turn.is_proven
+        if is_off and ((shift.size or 0.0) > _MOST_M or (turn.size or 0.0) > _MOST_RAD):
+            return figures._replace(outcome=MISFIT)
         if not is_off and (shift.is_beyond or turn.is_beyond):
             return figures._replace(reason="what is seen in one place contradicts the others")
         return figures._replace(
@@ -316,9 +346,9 @@ class PoseComparison:
 
     def _agree(self, along: F64Array, limit: float, most: float) -> bool:
         """Whether a residual along a direction of the corrections (u,) rests on no single place."""
-        for left_out in range(len(self._estimates)):
-            rest = _joined([*self._estimates[:left_out], *self._estimates[left_out + 1 :]])
-            if rest is None or float(along @ rest.covariance @ along) > (2 * most) ** 2:
+        for number in range(self.places):
+            rest = self._estimate(number)
+            if float(along @ rest.covariance @ along) > (2 * most) ** 2:
                 return False
             if float(along @ rest.value) < limit / 2:
                 return False
@@ -342,13 +372,13 @@ class PoseComparison:
 
         is_whole: all directions have to be determined.
         """
-        if len(self._kept) < _LEAST_PLACES:
+        if self.places < _LEAST_PLACES:
             return False
         moves = [
             other @ np.linalg.inv(pose) for pose, other in zip(self._poses, poses, strict=True)
         ]
         comparison = PoseComparison(self._names, poses, tries_others=False)
-        for place in self._kept:
+        for place in self._places[:_KEPT]:
             comparison.add([_moved(cloud, moves[cloud.lidar]) for cloud in place])
         figures = comparison.figures()[list(self._pairs).index(key)]
         return (
@@ -361,7 +391,7 @@ class PoseComparison:
         )
 
 
-@dataclass(slots=True)
+@dataclass(eq=False, repr=False)
 class _Part:
     """Length of a shift or turn in the directions that are determined, m or rad."""
 
@@ -381,40 +411,21 @@ def _moved(cloud: Cloud, move: F64Array) -> Cloud:
     return Cloud(cloud.lidar, points_m, cloud.time_s, origin_m)
 
 
-def _across(solution: Solution) -> int:
+def _across(rows: Rows) -> int:
     """Number of distances between surfaces of two lidars."""
-    return sum(count for (one, other), count in solution.matched.items() if one != other)
+    return int(np.count_nonzero(np.diff(rows.pair)))
 
 
-def _estimate(solution: Solution) -> _Estimate | None:
-    """The estimate of a place; None if it determines nothing."""
+def _estimate(solution: Solution) -> _Estimate:
+    """The estimate of a solution."""
     corrections = solution.state.corrections[1:]
     scale = np.tile(_SCALE, len(corrections))
     rotations = np.stack([one.rotation for one in corrections])
     shifts = np.stack([one.position_m for one in corrections])
     value = np.hstack([shifts, log_rotation(rotations)]).ravel() * scale
     covariance = solution.covariance * scale[:, None] * scale
-    if not np.isfinite(covariance).all() or solution.weak.shape[1] >= len(value):
-        return None
     covariance = (covariance + covariance.T) / 2
-    covariance = covariance + _UNKNOWN_M2 * np.matmul(solution.weak, solution.weak.T)
-    return _Estimate(value, covariance, np.linalg.inv(covariance))
-
-
-def _joined(estimates: Sequence[_Estimate]) -> _Estimate | None:
-    """The weighted mean of the estimates of all places; None without."""
-    if not estimates:
-        return None
-    information = np.sum([one.information for one in estimates], axis=0)
-    covariance = np.linalg.inv(information)
-    weighted = np.sum([np.matmul(one.information, one.value) for one in estimates], axis=0)
-    value = np.matmul(covariance, weighted)
-    spare = len(value) * (len(estimates) - 1)
-    squares = sum(
-        float((one.value - value) @ one.information @ (one.value - value)) for one in estimates
-    )
-    birge = max(1.0, squares / spare) if spare else 1.0
-    return _Estimate(value, covariance * birge, information / birge)
+    return _Estimate(value, covariance, solution.weak.shape[1])
 
 
 def _projected(matrix: F64Array, covariance: F64Array) -> F64Array:

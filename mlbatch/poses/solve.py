@@ -9,18 +9,20 @@ a small motion of its points in the body frame, after the pose that they were co
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import combinations, product
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from mlbatch.arrays import F64Array, I64Array
 from mlbatch.motion.registration import ORIGIN, Pose
 from mlbatch.motion.se3 import exp_rotation, log_rotation, skew
-from mlbatch.poses.stems import Stems, stem_distances, stems
 from mlbatch.poses.surfaces import Distances, Moments, Planes, distances
-from mlbatch.poses.votes import best_move
 from mlbatch.units import NS_PER_S
+
+if TYPE_CHECKING:
+    from mlbatch.poses.stems import Stems
 
 # Cauchy kernel: residuals of this many standard deviations have half of their weight.
 KERNEL = 2.5
@@ -52,7 +54,7 @@ _SMALL_M, _SMALL_RAD = 1e-4, 1e-5
 _SMALL_MPS, _SMALL_RADPS = 5e-3, 5e-4
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(eq=False, repr=False)
 class Cloud:
     """Points of one lidar in one window, or in a sweep as its driver cut it.
 
@@ -83,7 +85,7 @@ class Cloud:
 Place = Sequence[Cloud]
 
 
-@dataclass(slots=True, eq=False)
+@dataclass(eq=False, repr=False)
 class State:
     """What is solved for.
 
@@ -101,8 +103,7 @@ class State:
         return cls([ORIGIN] * lidars, np.zeros((places, 6)), np.zeros(lidars))
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Level:
+class Level(NamedTuple):
     """How surfaces are matched: edge of cells, least cosine between normals, most distance.
 
     points: most of a cloud that are used, about; doubled: how many sizes of cells are used besides,
@@ -135,8 +136,7 @@ _AGREES = Level(1.0, 0.94, 0.1)
 _MORE = 1.05
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Rows:
+class Rows(NamedTuple):
     """Equations of a place: m distances in standard deviations.
 
     jacobian: (m, poses + 6); noise: (m, poses + 6), its error by the noise of normals; residual:
@@ -218,9 +218,9 @@ class Problem:
 
     def clouds(self, place: int, state: State, edge_m: float) -> list[Planes]:
         """Planes of the clouds of a place, moved to its instant."""
-        return [sizes[0] for sizes in self._planes(place, state, Level(edge_m, 0.0, 0.0))]
+        return [sizes[0] for sizes in self.planes(place, state, Level(edge_m, 0.0, 0.0))]
 
-    def _planes(self, place: int, state: State, level: Level) -> list[list[Planes]]:
+    def planes(self, place: int, state: State, level: Level) -> list[list[Planes]]:
         """Planes of each cloud of a place and size of cells, moved to the instant of the place."""
         found: list[list[Planes]] = []
         for cloud in self.places[place]:
@@ -237,6 +237,11 @@ class Problem:
 
     def stems(self, place: int, state: State) -> list[Stems | None]:
         """Stems of the clouds of a place, moved to its instant."""
+        if all(cloud.origin_m is None for cloud in self.places[place]):
+            return [None] * len(self.places[place])
+        # Not loaded by checks of poses that need none.
+        from mlbatch.poses.stems import Stems, stems
+
         found: list[Stems | None] = []
         for number, cloud in enumerate(self.places[place]):
             if cloud.origin_m is None:
@@ -253,11 +258,16 @@ class Problem:
 
     def rows(self, state: State, level: Level) -> list[Rows]:
         """All equations at a state, by place."""
-        return [self._place_rows(number, state, level) for number in range(len(self.places))]
+        return [
+            self.place_rows(number, state, level, self.planes(number, state, level))
+            for number in range(len(self.places))
+        ]
 
-    def _place_rows(self, number: int, state: State, level: Level) -> Rows:
+    def place_rows(
+        self, number: int, state: State, level: Level, surfaces: Sequence[Sequence[Planes]]
+    ) -> Rows:
+        """The equations of a place with its planes."""
         place = self.places[number]
-        surfaces = self._planes(number, state, level)
         uprights = self.stems(number, state)
         parts = []
         for first, second in combinations(range(len(place)), 2):
@@ -267,6 +277,8 @@ class Problem:
                 parts.append(self._rows(pair, found, state.twists[number]))
             one, other = uprights[first], uprights[second]
             if one is not None and other is not None:
+                from mlbatch.poses.stems import stem_distances
+
                 axes = stem_distances(one, other, level.parallel, level.most_m)
                 if axes is not None:
                     parts.append(self._rows(pair, axes, state.twists[number]))
@@ -333,8 +345,7 @@ def moved(points_m: F64Array, time_s: F64Array, twist: F64Array) -> F64Array:
     return found
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Solution:
+class Solution(NamedTuple):
     """Outcome.
 
     covariance: (poses, poses) of the corrections, twists eliminated, m and rad; weak: (poses, w),
@@ -366,24 +377,28 @@ def solve(problem: Problem, state: State, level: Level, most_steps: int = 25) ->
     return Solution(state, covariance, weak, equations.matched(), equations.rms, converged)
 
 
-def estimate(problem: Problem, state: State, level: Level, steps: int = 3) -> Solution:
-    """Steps from a state with surfaces matched once, and residuals that change linearly."""
-    rows = problem.rows(state, level)
+def estimate(
+    problem: Problem,
+    rows: Sequence[Rows],
+    state: State,
+    steps: int = 3,
+    most_sigma_m: float | None = None,
+) -> Solution:
+    """Steps from a state with rows that were matched there, and residuals that change linearly."""
     equations = _Equations(problem, rows, state)
     for _ in range(steps):
         step = equations.step()
         state = _after(problem, state, step)
         twists = step[problem.poses :].reshape(-1, 6)
         rows = [
-            replace(
-                part,
+            part._replace(
                 residual=part.residual
                 + np.matmul(part.jacobian, np.concatenate([step[: problem.poses], twist])),
             )
             for part, twist in zip(rows, twists, strict=True)
         ]
         equations = _Equations(problem, rows, state)
-    covariance, weak = equations.determined()
+    covariance, weak = equations.determined(most_sigma_m)
     return Solution(state, covariance, weak, equations.matched(), equations.rms, False)
 
 
@@ -453,6 +468,8 @@ def after_move(pose: Pose, move: Pose) -> Pose:
 
 def _follow_votes(problem: Problem, state: State) -> bool:
     """Move each lidar whose stems meet those of the others elsewhere; whether there was one."""
+    from mlbatch.poses.votes import best_move
+
     followed = False
     for lidar in range(1, problem.lidars):
         sides = []
@@ -560,13 +577,14 @@ class _Equations:
         pairs, counts = np.unique(pair, axis=0, return_counts=True)
         return {(int(a), int(b)): int(n) for (a, b), n in zip(pairs, counts, strict=True)}
 
-    def determined(self) -> tuple[F64Array, F64Array]:
+    def determined(self, most_sigma_m: float | None = None) -> tuple[F64Array, F64Array]:
         """Covariance of the poses, and the directions that are not determined.
 
         Normals are not exact, which adds information in directions that nothing shows. The errors
         of the two normals of a distance are independent: the product of both is free of them.
         """
         size = self.problem.poses
+        most_m = most_sigma_m or _MOST_SIGMA_M
         if not size:
             return np.zeros((0, 0)), np.zeros((0, 0))
         known_before = self._information * self._units * self._units[:, None]
@@ -593,7 +611,7 @@ class _Equations:
         score, lever, noise = map(np.concatenate, (scores, levers, noises))
         known, axes = np.linalg.eigh(true)
         share = known / np.maximum(np.einsum("ik,ij,jk->k", axes, plain, axes), 1e-12)
-        seen = (known > _MOST_SIGMA_M**-2.0) & (share > _TRUE_SHARE)
+        seen = (known > most_m**-2.0) & (share > _TRUE_SHARE)
         # Sums of a block count as one observation (sandwich).
         _, number = np.unique(block, return_inverse=True)
         count = int(number.max()) + 1 if len(number) else 0
@@ -606,9 +624,16 @@ class _Equations:
         covariance += before * inverse * inverse[:, None]
         by_block = np.zeros((count, size))
         np.add.at(by_block, number, np.matmul(lever, axes) ** 2 - np.matmul(noise, axes) ** 2)
-        effective = by_block.sum(axis=0) ** 2 / np.maximum((by_block**2).sum(axis=0), 1e-12)
-        is_enough = (effective >= _FEWEST_BLOCKS) | (np.diag(before) > _MOST_SIGMA_M**-2.0)
-        seen &= is_enough & (np.diag(covariance) < _MOST_SIGMA_M**2)
+        total = by_block.sum(axis=0)
+        if most_sigma_m is None:
+            effective = total**2 / np.maximum((by_block**2).sum(axis=0), 1e-12)
+            seen &= (effective >= _FEWEST_BLOCKS) | (np.diag(before) > _MOST_SIGMA_M**-2.0)
+        else:
+            # No better than without the strongest block.
+            rest = np.maximum(total - by_block.max(axis=0, initial=0.0), 1e-12)
+            spare = np.maximum(0.0, 1.0 / rest - np.diag(covariance))
+            covariance += np.diag(np.where(seen, spare, 0.0))
+        seen &= np.diag(covariance) < most_m**2
         covariance[~seen] = 0.0
         covariance[:, ~seen] = 0.0
         covariance += np.diag(np.where(seen, 0.0, _UNKNOWN_M**2))

@@ -11,6 +11,9 @@ MEASURED = "measured"
 OFF = "off"
 MISFIT = "misfit"
 NOT_CHECKED = "not checked"
+# A wrong pose: a residual above these is a warning.
+LIMIT_MM = 30.0
+LIMIT_DEG = 0.3
 # Mistakes that explain a wrong pose.
 EXCHANGED = "exchanged"
 RADIANS = "radians"
@@ -69,6 +72,8 @@ class PairFigures(NamedTuple):
             )
         if self.outcome == OFF:
             found = f"double walls: {self.lidars[-1]} is {self._found()} off"
+        elif not self.is_within:
+            found = f"they are not proven to be apart: {self._found(with_sigma=True)}"
         else:
             found = f"they agree within {_bounds([self])}"
         text = f"{seen}; {found}"
@@ -83,12 +88,21 @@ class PairFigures(NamedTuple):
             return "; with rotation_rpy_deg as radians they fit: write degrees"
         return ""
 
-    def _found(self) -> str:
+    @property
+    def is_within(self) -> bool:
+        """Whether the figures and two standard deviations are within the limits."""
+        shift_mm = (self.shift_mm or 0.0) + 2 * (self.shift_deviation_mm or 0.0)
+        turn_deg = (self.turn_deg or 0.0) + 2 * (self.turn_deviation_deg or 0.0)
+        return shift_mm <= LIMIT_MM and turn_deg <= LIMIT_DEG
+
+    def _found(self, *, with_sigma: bool = False) -> str:
         parts = []
         if self.shift_mm is not None:
-            parts.append(f"{self.shift_mm:.0f} mm")
+            sigma = f" (standard deviation {self.shift_deviation_mm:.0f} mm)" if with_sigma else ""
+            parts.append(f"{self.shift_mm:.0f} mm{sigma}")
         if self.turn_deg is not None:
-            parts.append(f"{self.turn_deg:.2f} degrees")
+            sigma = f" (standard deviation {self.turn_deviation_deg:.2f})" if with_sigma else ""
+            parts.append(f"{self.turn_deg:.2f} degrees{sigma}")
         return " / ".join(parts)
 
 
@@ -126,7 +140,9 @@ class PoseFigures(NamedTuple):
         if any(pair.is_wrong for pair in known):
             return "poses are wrong"
         text = f"surfaces agree within {_bounds(known)}"
-        if any(pair.undetermined for pair in known):
+        if not all(pair.is_within for pair in known):
+            text = "poses: neither proven to be right nor wrong"
+        elif any(pair.undetermined for pair in known):
             text += " in the directions that the scene determines"
         if len(known) < len(self.pairs):
             text += f", of {len(known)} of {len(self.pairs)} pairs of lidars"

@@ -119,7 +119,7 @@ def identity(extrinsics: Sensors) -> None:
         (swap, (OFF, MISFIT), EXCHANGED, "pose", "names swapped?"),
         (radians, (OFF, MISFIT), RADIANS, "pose", "write degrees"),
         (millimetres, (NOT_CHECKED,), "", "far_pose", "as millimetres this would be"),
-        (identity, (OFF, MISFIT), "", "same_pose", "expected a pose of its own"),
+        (identity, (MISFIT,), "", "same_pose", "expected a pose of its own"),
     ],
 )
 def test_usual_mistakes_are_named(
@@ -215,6 +215,11 @@ PAIR = PairFigures(("left", "right"), MEASURED, "", 3, 90, 41.2, 100.0, 6.0, 1.0
             "0.40 degrees off",
         ),
         (
+            PAIR._replace(shift_mm=17.0, turn_deg=0.5, turn_deviation_deg=0.08),
+            "left and right have 41 % of their surfaces in common; they are not proven to be "
+            "apart: 17 mm (standard deviation 1 mm) / 0.50 degrees (standard deviation 0.08)",
+        ),
+        (
             PAIR._replace(shift_mm=None, undetermined=("shift along x",)),
             "left and right have 41 % of their surfaces in common; they agree within 0.05 degrees "
             "(this check does not determine: shift along x)",
@@ -233,6 +238,14 @@ def test_a_verdict_says_what_it_covers() -> None:
     other = PairFigures(("left", "rear"), NOT_CHECKED, "the lidars see nothing in common")
     assert PoseFigures(pairs=(PAIR, other)).describe() == (
         "surfaces agree within 8 mm, 0.05 degrees, of 1 of 2 pairs of lidars"
+    )
+    open_pair = PAIR._replace(turn_deg=0.29)
+    assert PoseFigures(pairs=(PAIR, open_pair)).describe() == (
+        "surfaces agree within 8 mm, 0.30 degrees"
+    )
+    open_pair = PAIR._replace(turn_deg=0.3)
+    assert PoseFigures(pairs=(PAIR, open_pair)).describe() == (
+        "poses: neither proven to be right nor wrong"
     )
 
 
