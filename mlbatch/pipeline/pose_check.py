@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from mlbatch.batching.windows import Window
     from mlbatch.poses.check import PoseComparison
 
-# Of a lidar in a window, and where few surfaces match; of more, every second column is read, or
+# Of a lidar in a window, until surfaces match and then; of more, every second column is read, or
 # every third.
 _SLOTS, _MORE_SLOTS = 1 << 14, 1 << 15
 # Points (n, 3) of a window or slice, their times (n,) in ns, their lidars (n,).
@@ -89,8 +89,8 @@ class PoseCheck:
     def _points(self, window: Window) -> _Points:
         """Points of some columns; columns of a sensor are taken at equal steps."""
         columns = window.columns
-        needs_all = self._comparison is not None and self._comparison.needs_all
-        most = _MORE_SLOTS if needs_all else _SLOTS
+        is_common = self._comparison is not None and self._comparison.is_common
+        most = _MORE_SLOTS if is_common else _SLOTS
         taken: list[I64Array] = []
         for number, slots in enumerate(self._slots):
             rows = np.flatnonzero(columns.sensor == number)

@@ -147,7 +147,9 @@ class PoseComparison:
         self._is_misfit = False
         # Whether planes of some points were too little.
         self._needs_stems = False
-        self.needs_all = False
+        self._needs_all = False
+        # Whether lidars see something in common, so that more points pay.
+        self.is_common = False
 
     @property
     def places(self) -> int:
@@ -181,13 +183,14 @@ class PoseComparison:
         if across <= _CHANCE:
             # Nothing is in common; stems would add nothing either.
             return
+        self.is_common = True
         self._joined = self._estimate()
         if self._joined.weak >= _WEAK and not self._needs_stems:
             self._needs_stems = True
             self._places[-1] = self._used(place)
             self._rows[-1] = self._matched(self._places[-1], state)
             self._joined = self._estimate()
-        self.needs_all |= across < _FEW_SURFACES
+        self._needs_all |= across < _FEW_SURFACES
 
     def _used(self, place: Place) -> Place:
         """A place with what is needed of it."""
@@ -196,7 +199,7 @@ class PoseComparison:
     @property
     def _level(self) -> tuple[Level, int]:
         """How surfaces are matched, and which size of cells is counted."""
-        return _RICH if self.needs_all else _LIGHT
+        return _RICH if self._needs_all else _LIGHT
 
     def _matched(self, place: Place, state: State, *, counts: bool = False) -> Rows:
         """Match the surfaces of a place, with a motion that is put into the state."""
@@ -236,10 +239,10 @@ class PoseComparison:
 
     def figures(self) -> tuple[PairFigures, ...]:
         """What is known of each pair."""
+        if not self._tries_others:
+            return self._measured()
         self._rematch()
         found = self._measured()
-        if not self._tries_others:
-            return found
         return tuple(map(self._with_cause, self._pairs, found))
 
     def _rematch(self) -> None:
@@ -380,6 +383,8 @@ class PoseComparison:
         comparison = PoseComparison(self._names, poses, tries_others=False)
         for place in self._places[:_KEPT]:
             comparison.add([_moved(cloud, moves[cloud.lidar]) for cloud in place])
+            if comparison._is_misfit:
+                return False
         figures = comparison.figures()[list(self._pairs).index(key)]
         return (
             figures.outcome == MEASURED
