@@ -7,8 +7,9 @@ from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
-from mlbatch.batch.session import SESSION_JSON, STARTED_JSON
+from mlbatch.batch.session import STARTED_JSON
 from mlbatch.bounded import parse_json, read_text
+from mlbatch.outputs.run_files import SESSION_JSON
 from mlbatch.writers import write_text
 
 SCHEMA = "mlbatch.session/1"

@@ -13,7 +13,6 @@ from mlbatch.errors import RigError, UsageError
 if TYPE_CHECKING:
     from mlbatch.rig.rig import Rig
 
-SESSION_JSON = "session.json"
 # The key of a run that has begun; removed when session.json is there.
 STARTED_JSON = "started.json"
 REPORT_JSON = "report.json"

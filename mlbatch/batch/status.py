@@ -8,14 +8,16 @@ from fnmatch import fnmatch
 from pathlib import Path
 
 from mlbatch.batch.record import DONE, FAILED, KNOWN_BAD, SessionRecord, read_record
-from mlbatch.batch.session import LOG_TXT, SESSION_JSON, STARTED_JSON, is_url
+from mlbatch.batch.session import LOG_TXT, STARTED_JSON, is_url
 from mlbatch.errors import RecordingError
+from mlbatch.outputs.run_files import SESSION_JSON
 from mlbatch.report.report import CUT_OFF
 
 # Warnings of clocks, as in the page of a run.
 CLOCK_CODES = frozenset(
     {"clocks", "clock_jump", "clock_epoch", "host_step", "timescale", "cloud_time"}
 )
+POSE_CODES = frozenset({"pose", "same_pose", "far_pose", "identity_extrinsics"})
 UNFINISHED = "unfinished"
 SKIPPED = "skipped"
 STATES = (DONE, FAILED, UNFINISHED, KNOWN_BAD)
@@ -71,6 +73,11 @@ class SessionStatus:
     def clock_codes(self) -> list[str]:
         """Warnings about clocks."""
         return [] if self.record is None else sorted(CLOCK_CODES & set(self.record.warnings))
+
+    @property
+    def has_pose_warning(self) -> bool:
+        """Whether a warning says that poses may be wrong: the scans look good, and are not."""
+        return self.record is not None and not POSE_CODES.isdisjoint(self.record.warnings)
 
     @property
     def loss(self) -> float:

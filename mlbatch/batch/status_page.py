@@ -33,7 +33,10 @@ _FILL_WARNING = 0.9
 def write_status_page(path: Path, status: BatchStatus) -> None:
     """Write the page; an earlier page is replaced, any other file never."""
     check_page(path, overwrite=True)
-    sessions = sorted(status.sessions, key=lambda one: (_ORDER.index(one.state), one.name))
+    sessions = sorted(
+        status.sessions,
+        key=lambda one: (_ORDER.index(one.state), not one.has_pose_warning, one.name),
+    )
     page = render(
         "batch.html",
         title=Path(status.output).name or status.output,
@@ -58,12 +61,15 @@ def _verdict(status: BatchStatus) -> Verdict:
     failed, unfinished = status.count(FAILED), status.count(UNFINISHED)
     known_bad = status.count(KNOWN_BAD)
     cut_off = sum(one.is_cut_off for one in status.sessions)
-    level = "problem" if failed else "warning" if unfinished or cut_off else "good"
+    poses = sum(one.has_pose_warning for one in status.sessions)
+    doubtful = unfinished or cut_off or poses
+    level = "problem" if failed else "warning" if doubtful else "good"
     heading = f"{status.count(DONE)} of {count} sessions are done"
     if failed:
         heading = f"{failed} of {count} sessions failed"
     parts = [f"{unfinished} unfinished: running, or interrupted."] * bool(unfinished)
     parts += [f"{known_bad} known as bad, not converted."] * bool(known_bad)
+    parts += [f"{poses} with a warning of poses."] * bool(poses)
     parts += [f"{cut_off} with a recording that was cut off."] * bool(cut_off)
     return Verdict(level, level, heading, " ".join(parts))
 
@@ -90,6 +96,8 @@ def _levels(one: SessionStatus) -> dict[str, str]:
         levels["lost"] = "problem" if one.loss >= _LOSS_PROBLEM else "warning"
     if fill < _FILL_WARNING:
         levels["fill"] = "warning"
+    if one.has_pose_warning:
+        levels[""] = "warning"
     if one.is_cut_off:
         levels[""] = "problem"
     return levels

@@ -36,7 +36,6 @@ from mlbatch.batch.session import (
     OWN,
     PAGE_HTML,
     REPORT_JSON,
-    SESSION_JSON,
     STARTED_JSON,
     Session,
     is_url,
@@ -51,6 +50,7 @@ from mlbatch.errors import (
     RecordingError,
     one_line,
 )
+from mlbatch.outputs.run_files import SESSION_JSON
 from mlbatch.report.report import report_of
 
 # Exit codes of `convert` that another attempt would not change, and that of a limit.

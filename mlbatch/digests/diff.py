@@ -5,8 +5,9 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from fractions import Fraction
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -16,12 +17,13 @@ from mlbatch.errors import UsageError
 from mlbatch.outputs.read import read
 from mlbatch.outputs.run_files import RunFiles
 from mlbatch.outputs.scan import Scan
+from mlbatch.units import NS_PER_S
 
 
 class _Key(NamedTuple):
     """Window and sensor, by which scans of two outputs are matched."""
 
-    window: tuple[int, int]  # index, slice
+    window: tuple[int, int]  # index in the first output, slice
     sensor: str
 
 
@@ -69,13 +71,14 @@ def check_tolerance(tolerance: float) -> None:
 def diff(a: Path, b: Path, tolerance: float = 0.0) -> OutputDiff:
     """Compare all scans of two outputs in the fields that both store; tolerance: of reals.
 
-    Raises RecordingError where one of them is damaged.
+    Scans of one window of time are compared, whatever their numbers. Raises RecordingError where
+    one of them is damaged.
     """
     result = OutputDiff()
     old, new = (describe_run(output, RunFiles.of(output).texts()[0]) for output in (a, b))
     result.run += walk("", old, new, tolerance)
-    for key, one, other in _pairs(a, b):
-        name = scan_name(*key.window, key.sensor)
+    for one, other in _pairs(_Side(a), _Side(b, _windows_between(old, new))):
+        name = _name(one, other)
         if one is None or other is None:
             (result.only_in_b if one is None else result.only_in_a).append(name)
         else:
@@ -84,16 +87,35 @@ def diff(a: Path, b: Path, tolerance: float = 0.0) -> OutputDiff:
     return result
 
 
+def _name(*scans: Scan | None) -> str:
+    """The name of a scan in the first output that has it."""
+    return next(scan_name(one.index, one.slice, one.sensor) for one in scans if one is not None)
+
+
 # -- scans in both ----------------------------------------------------------------------------
 
 
-def _pairs(a: Path, b: Path) -> Iterator[tuple[_Key, Scan | None, Scan | None]]:
+def _windows_between(a: Any, b: Any) -> int:
+    """How many windows later `b` begins; 0 where their grids differ."""
+    try:
+        rate, other = (Fraction(run["grid"]["rate_hz"]) for run in (a, b))
+        begin_ns, other_ns = (int(run["grid"]["t_init_ns"]) for run in (a, b))
+    except (KeyError, TypeError, ValueError):
+        # Without a report.
+        return 0
+    count = round((other_ns - begin_ns) * rate / NS_PER_S)
+    # Bounds are rounded up to whole nanoseconds.
+    is_one_grid = rate == other and abs(count * NS_PER_S / rate - (other_ns - begin_ns)) < 1
+    return count if is_one_grid else 0
+
+
+def _pairs(a: _Side, b: _Side) -> Iterator[tuple[Scan | None, Scan | None]]:
     """Scans of both outputs by window, with None where one output lacks the scan.
 
     Scans wait for their counterpart while that can come: folders have them sensor by sensor, other
     outputs window by window.
     """
-    sides = (_Side(a), _Side(b))
+    sides = (a, b)
     while not all(side.is_done for side in sides):
         for side, other in (sides, sides[::-1]):
             scan = side.next()
@@ -104,18 +126,19 @@ def _pairs(a: Path, b: Path) -> Iterator[tuple[_Key, Scan | None, Scan | None]]:
             if match is None:
                 side.waiting[key] = scan
             else:
-                yield (key, scan, match) if side is sides[0] else (key, match, scan)
+                yield (scan, match) if side is a else (match, scan)
         yield from _unmatched(sides)
     yield from _unmatched(sides)
 
 
 class _Side:
-    """One output; waiting: scans without a counterpart so far."""
+    """One output; waiting: scans without a counterpart so far; later: windows to the first."""
 
-    def __init__(self, output: Path) -> None:
+    def __init__(self, output: Path, later: int = 0) -> None:
         self._scans = read(output)
+        self._later = later
         self.waiting: dict[_Key, Scan] = {}
-        self.key = _Key((-2, 0), "")
+        self.key = _Key((later - 2, 0), "")
         self.is_done = False
         self.is_by_sensor = output.is_dir() and any(one.is_dir() for one in output.iterdir())
 
@@ -125,7 +148,7 @@ class _Side:
         if scan is None:
             self.is_done = True
         else:
-            self.key = _Key((scan.index, scan.slice), scan.sensor)
+            self.key = _Key((scan.index + self._later, scan.slice), scan.sensor)
         return scan
 
     def has_passed(self, key: _Key) -> bool:
@@ -135,11 +158,11 @@ class _Side:
         return not self.is_by_sensor and self.key.window > key.window
 
 
-def _unmatched(sides: tuple[_Side, _Side]) -> Iterator[tuple[_Key, Scan | None, Scan | None]]:
+def _unmatched(sides: tuple[_Side, _Side]) -> Iterator[tuple[Scan | None, Scan | None]]:
     for side, other in (sides, sides[::-1]):
         for key in [key for key in side.waiting if other.has_passed(key)]:
             scan = side.waiting.pop(key)
-            yield (key, scan, None) if side is sides[0] else (key, None, scan)
+            yield (scan, None) if side is sides[0] else (None, scan)
 
 
 # -- values -----------------------------------------------------------------------------------

@@ -16,6 +16,8 @@ if TYPE_CHECKING:
     from mlbatch.outputs.mcap_file import McapFile
 
 TABLE = "scans.csv"
+# How a session of a batch ended; in its folder.
+SESSION_JSON = "session.json"
 # In mlbatch.grid of each of several files; their report and table are in the folder.
 PIECES = "windows_per_file"
 # In the header of an MCAP file: the version, which simulated and extracted recordings do not have.

@@ -11,9 +11,10 @@ from typing import SupportsIndex, overload
 import numpy as np
 
 from mlbatch.arrays import I64Array
+from mlbatch.bounded import parse_json, read_text
 from mlbatch.errors import UsageError
 from mlbatch.outputs.read import IndexedScans, open_scans
-from mlbatch.outputs.run_files import is_output
+from mlbatch.outputs.run_files import SESSION_JSON, is_output
 from mlbatch.outputs.scan import Scan
 from mlbatch.outputs.table import Rows
 from mlbatch.writers import SHARD_JSON
@@ -69,7 +70,7 @@ class Dataset(Sequence[Scan]):
         number of this scan; path: of the file with the scan. `pandas.DataFrame(dataset.table)`.
         """
         places = [
-            (self._outputs[output].path.name, *self._outputs[output].places[own])
+            (_session_name(self._outputs[output].path), *self._outputs[output].places[own])
             for output, own in self._places.tolist()
         ]
         # Texts as wide as the longest.
@@ -88,15 +89,24 @@ class Dataset(Sequence[Scan]):
         return f"<Dataset: {len(self)} scans of {outputs}{skipped}>"
 
 
+def _session_name(path: Path) -> str:
+    """The name of an output, or of its session in a batch."""
+    return path.parent.name if (path.parent / SESSION_JSON).exists() else path.name
+
+
 def dataset_of(paths: Iterable[Path]) -> Dataset:
     """The scans of outputs; of a pattern all finished outputs that match it."""
     outputs: list[IndexedScans] = []
     skipped: list[Path] = []
     for path in paths:
         if path.exists() or not glob.has_magic(str(path)):
-            outputs.append(open_scans(path))
+            outputs += map(open_scans, _of_session(path))
             continue
-        matches = [Path(match) for match in sorted(glob.glob(str(path), recursive=True))]
+        matches = [
+            output
+            for match in sorted(glob.glob(str(path), recursive=True))
+            for output in _of_session(Path(match))
+        ]
         finished = [match for match in matches if _is_whole(match) and is_output(match)]
         if not finished:
             raise UsageError(
@@ -113,6 +123,16 @@ def dataset_of(paths: Iterable[Path]) -> Dataset:
         for at, one in enumerate(outputs)
     ]
     return Dataset(outputs, skipped, np.concatenate(places))
+
+
+def _of_session(path: Path) -> list[Path]:
+    """The outputs in the folder of a session of `mlbatch batch` that is done; else the path."""
+    try:
+        record = parse_json(read_text(path / SESSION_JSON))
+        is_done = record["state"] == "done"
+        return [path / name for name in record["outputs"]] if is_done else [path]
+    except (OSError, ValueError, LookupError, TypeError):
+        return [path]
 
 
 def _is_whole(path: Path) -> bool:

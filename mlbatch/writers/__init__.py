@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 from typing import TYPE_CHECKING, NamedTuple
 
 from mlbatch.errors import UsageError
@@ -166,6 +167,14 @@ def _refuse_file_name(target: Path, suffix: str) -> None:
         raise UsageError(
             f"-o {target}: expected a folder, since {name} output is one file per scan, found a "
             f"file name; give -o {target.with_suffix('')} --format {name}"
+        )
+    # A folder may have any name, but a word that is nearly a suffix is one with a mistake.
+    known = [f".{one}" for one in (*ONE_FILE, "mcap", "bag")]
+    near = difflib.get_close_matches(suffix, known, n=1, cutoff=0.75)
+    if near:
+        raise UsageError(
+            f"-o {target}: expected the suffix of an output, found {suffix!r}; the nearest is "
+            f"{near[0]}, and a folder has none"
         )
     if suffix == ".db3":
         raise UsageError(

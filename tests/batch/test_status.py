@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 
+import mlbatch
 from tests.batch.sessions import Dataset, run, write_dataset
 from tests.builders.run import command
 
@@ -105,3 +106,9 @@ def test_another_file_is_not_replaced_by_a_page(data: Dataset, tmp_path: Path) -
     page.write_text("mine", encoding="utf-8")
     assert command("batch-status", data.folder / "out", "--page", page).code == 1
     assert page.read_text(encoding="utf-8") == "mine"
+
+
+def test_a_dataset_has_the_sessions_that_are_done(data: Dataset) -> None:
+    found = mlbatch.dataset(data.folder / "out" / "*")
+    assert set(found.table["session"]) == {"a1", "cut1"}
+    assert {path.name for path in found.skipped} >= {"cut2", "hopeless", "later"}

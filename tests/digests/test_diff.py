@@ -9,8 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import mlbatch
 from mlbatch.digests.diff import diff
-from tests.builders.run import command
+from tests.builders.run import ROOT, command
 from tests.digests.test_digest import FORMATS, MOVED, convert, other_rig
 from tests.verification.edits import edit_of
 
@@ -183,3 +184,20 @@ def test_no_output_is_one_line(tmp_path: Path, a: str, b: str) -> None:
     assert (found.code, found.out) == (1, "")
     assert len(found.err.splitlines()) == 1
     assert "check the name" in found.err
+
+
+def test_windows_meet_whatever_their_numbers(tmp_path: Path) -> None:
+    """A piece of a recording has the scans of the whole one, numbered from its own start."""
+    fixture = ROOT / "fixtures" / "two_lidars"
+    rig = fixture / "rig.yaml"
+    recording = fixture / "two_lidars.pcap"
+    piece = tmp_path / "piece.pcap"
+    mlbatch.extract(recording, piece, rig=rig, start="+0.2s", duration=0.4)
+    for name, source in (("whole", recording), ("part", piece)):
+        mlbatch.convert(source, tmp_path / name, rig=rig, rate=20)
+    found = diff(tmp_path / "whole", tmp_path / "part")
+    count = len(list(mlbatch.read(tmp_path / "part")))
+    assert count > 4
+    assert (found.compared, found.only_in_b, found.fields) == (count, [], {})
+    total = len(list(mlbatch.read(tmp_path / "whole")))
+    assert len(found.only_in_a) == total - count
