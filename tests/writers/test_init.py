@@ -73,6 +73,7 @@ def test_suffix_and_option_choose(target: str, asked: str | None, expected: str)
         ("x.LAZ", "laz", "-o x --format laz"),
         ("x.bin", None, "-o x --format kitti"),
         ("x.db3", None, "-o x --format rosbag2"),
+        ("x.bagg", None, "the nearest is .bag"),
         ("x.bag", "rosbag2", "leave out .bag"),
         ("x.bag", "mcap", "the name of a .mcap file for --format mcap, found that of a rosbag1"),
         ("x.mcap", "rosbag1", "change .mcap or leave out the option"),
