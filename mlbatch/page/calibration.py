@@ -69,11 +69,11 @@ def _verdict(found: Calibration) -> Verdict:
     worst = max(found.pairs, key=lambda pair: pair.after.apart_mm)
     heading = (
         f"Surfaces of {worst.first} and {worst.second} are {worst.after.apart_mm:.1f} mm apart, "
-        f"{worst.before.apart_mm:.1f} mm with the guess"
+        f"{worst.before.apart_mm:.1f} mm before"
     )
     others = (
-        f"{100 * worst.after.share:.0f} % of the surfaces in common agree within 10 cm, with the "
-        f"guess {100 * worst.before.share:.0f} %. All six directions of every pose are determined."
+        f"{100 * worst.after.share:.0f} % of the surfaces in common agree within 10 cm, "
+        f"{100 * worst.before.share:.0f} % did before. All six directions of every pose are determined."
     )
     if found.level:
         others += f" {found.level}."
@@ -139,7 +139,7 @@ def _pictures(view: View, cut: _Cut) -> dict[str, object]:
         "title": cut.title,
         "about": f"{across} to the right, {up} up; {2 * cut.half_m:.1f} m wide",
         "pictures": [
-            ("with the guess", [_dots(cloud, cut) for cloud in view.before]),
+            ("before", [_dots(cloud, cut) for cloud in view.before]),
             ("calibrated", [_dots(cloud, cut) for cloud in view.after]),
         ],
     }

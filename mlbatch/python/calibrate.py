@@ -327,7 +327,7 @@ def rig_text(job: Job, found: Calibration, folder: Path, on: date) -> str:
     ]
     source = ", ".join(path.name for path in job.recordings)
     notes = {
-        lidar.name: f"extrinsics as in {guess.name}; the others are relative to it"
+        lidar.name: _of_first(rig.sensors, lidar.name, guess.name)
         if lidar.is_fixed
         else f"extrinsics by mlbatch calibrate, {on.isoformat()}, from {source}; standard "
         f"deviations {_deviations(lidar)} (x, y, z of the body)"
@@ -338,6 +338,15 @@ def rig_text(job: Job, found: Calibration, folder: Path, on: date) -> str:
     )
     refined: Rig = replace(rig, sensors=tuple(sensors))
     return write_rig(refined, folder, notes)
+
+
+def _of_first(sensors: Sequence[RigSensor], name: str, guess: str) -> str:
+    """Where the first lidar is: the only one that is not measured."""
+    is_known = any(
+        one.name == name and not isinstance(one.extrinsics, UnknownExtrinsics) for one in sensors
+    )
+    origin = f"as in {guess}" if is_known else f"the origin of the body, as {guess} has no pose"
+    return f"extrinsics: {origin}; the others are relative to it"
 
 
 def _rig_path(job: Job) -> Path:
