@@ -103,8 +103,10 @@ def _run_one(job: Job, target: Target) -> list[str]:
     if not target.limits:
         return []
     # Not loaded without limits.
-    from mlbatch.report.limits import exceeded
+    from mlbatch.report.limits import exceeded, not_covered
 
+    for gap in not_covered(target.limits, report):
+        say(f"limit not tested: {gap}")
     return exceeded(target.limits, report)
 
 

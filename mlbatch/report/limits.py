@@ -66,6 +66,16 @@ def exceeded(limits: Sequence[Limit], report: RunReport) -> list[str]:
     return [line for limit in limits if (line := limit.exceeded(report))]
 
 
+def not_covered(limits: Sequence[Limit], report: RunReport) -> list[str]:
+    """One line for each pair of lidars that a limit of poses says nothing, or not all, about."""
+    return [
+        f"{limit.text}: {gap}"
+        for limit in limits
+        if limit.quantity == POSE
+        for gap in (["not checked"] if report.poses is None else report.poses.gaps())
+    ]
+
+
 def _parsed(text: str) -> Limit:
     found = re.fullmatch(_LIMIT, text, re.ASCII)
     if found is None:

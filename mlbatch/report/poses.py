@@ -129,6 +129,19 @@ class PoseFigures(NamedTuple):
     reason: str = ""
     pairs: tuple[PairFigures, ...] = ()
 
+    def gaps(self) -> list[str]:
+        """What the check does not cover, a line each."""
+        if self.reason:
+            return [f"not checked ({self.reason})"]
+        return [
+            pair.describe()
+            if not pair.is_known
+            else f"{' and '.join(pair.lidars)}: the scene does not determine "
+            f"{', '.join(pair.undetermined)}"
+            for pair in self.pairs
+            if pair.undetermined or not pair.is_known
+        ]
+
     def describe(self) -> str:
         """What a verdict says of the poses."""
         if self.reason:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from mlbatch.errors import UsageError
-from mlbatch.report.limits import exceeded, parse_limits
+from mlbatch.report.limits import exceeded, not_covered, parse_limits
 from mlbatch.report.report import RunReport
 
 REPORT = RunReport.from_json(
@@ -33,13 +33,17 @@ REPORT = RunReport.from_json(
                     **{"lidars": ["a", "b"], "outcome": "off", "overlap_percent": 41.2},
                     **{"shift_mm": 31.0, "shift_deviation_mm": 2.0},
                     **{"turn_deg": 0.4, "turn_deviation_deg": 0.01},
+                    "undetermined": ["shift along x"],
                 },
             ]
         },
         "warnings": [{"code": "clouds"}, {"code": "loss"}, {"code": "cut_off"}],
     }
 )
-APART = "a and b have 41 % of their surfaces in common; double walls: b is 31 mm / 0.40 degrees off"
+APART = (
+    "a and b have 41 % of their surfaces in common; double walls: b is 31 mm / 0.40 degrees off "
+    "(this check does not determine: shift along x)"
+)
 EXCEEDED = [
     # 10 of 1000 of b, 1 of 1000 of a.
     ("loss>0.99%", "loss>0.99%: found b: 10 of 1000 (1 %) packets lost"),
@@ -74,6 +78,14 @@ EXCEEDED = [
 @pytest.mark.parametrize(("text", "line"), EXCEEDED)
 def test_limits_by_hand(text: str, line: str) -> None:
     assert exceeded(parse_limits([text]), REPORT) == ([line] if line else [])
+
+
+def test_what_a_limit_of_poses_does_not_cover_is_said() -> None:
+    assert not_covered(parse_limits(["pose>5cm,loss>1"]), REPORT) == [
+        "pose>5cm: a and c: not checked, since seen nothing",
+        "pose>5cm: a and b: the scene does not determine shift along x",
+    ]
+    assert not_covered(parse_limits(["loss>1"]), REPORT) == []
 
 
 def test_limits_may_be_in_one_list_or_in_several() -> None:
