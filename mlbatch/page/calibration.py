@@ -73,7 +73,8 @@ def _verdict(found: Calibration) -> Verdict:
     )
     others = (
         f"{100 * worst.after.share:.0f} % of the surfaces in common agree within 10 cm, "
-        f"{100 * worst.before.share:.0f} % did before. All six directions of every pose are determined."
+        f"{100 * worst.before.share:.0f} % did before. All six directions of every pose are "
+        "determined."
     )
     if found.level:
         others += f" {found.level}."
