@@ -223,7 +223,12 @@ REFUSED = [
 
 @pytest.mark.parametrize(("name", "topic", "message"), REFUSED)
 def test_messages_that_are_refused(name: str, topic: Topic, message: str, tmp_path: Path) -> None:
-    writer = open_writer(name, tmp_path / OUTPUTS[name], run_info(), WriterOptions())
+    info = run_info()
+    # Both lidars have an IMU, whose samples are messages of the scans.
+    sensors = tuple(replace(one, sensor_from_imu=np.eye(4)) for one in info.sensors)
+    writer = open_writer(
+        name, tmp_path / OUTPUTS[name], info._replace(sensors=sensors), WriterOptions()
+    )
     run_job(writer.write(dense_scan()))
     with pytest.raises(ExportError, match=message):
         writer.write_message(note(topic, "x", 0))
