@@ -9,6 +9,7 @@ R (1, 0, 0) + t, by hand, at known times.
 from __future__ import annotations
 
 import gzip
+import inspect
 import json
 from collections.abc import Callable, Mapping, Sequence
 from datetime import datetime, timezone
@@ -17,7 +18,6 @@ from typing import Any
 
 import numpy as np
 from rosbags.rosbag1 import Writer as Writer1
-from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as Writer2
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
@@ -295,7 +295,10 @@ def bag(name: str, *topics: Topic) -> None:
 
 def folder(name: str, *topics: Topic) -> None:
     """A ROS 2 bag in the order of log times."""
-    with Writer2(Path(name), version=9, storage_plugin=StoragePlugin.SQLITE3) as writer:
+    # SQLite in all; rosbags before 0.10 asks for no version.
+    has_versions = "version" in inspect.signature(Writer2).parameters
+    options: dict[str, Any] = {"version": 9} if has_versions else {}
+    with Writer2(Path(name), **options) as writer:
         known = {one[0]: writer.add_connection(one[0], one[1], typestore=ROS2) for one in topics}
         messages = [(log, topic, kind, one) for topic, kind, some in topics for log, one in some]
         for log_ns, topic, kind, message in sorted(messages, key=lambda one: one[:2]):
