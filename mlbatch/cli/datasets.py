@@ -35,3 +35,4 @@ def datasets(
         rows.append([one, *facts[2:6], "refused" if facts.refused else facts.mark])
     for line in table_lines(rows):
         typer.echo(line)
+    typer.echo("mlbatch convert RECORDING --dataset NAME -o scans.mcap")

@@ -576,6 +576,6 @@ def _refuse_unknown(missing: Sequence[str], reasons: Mapping[str, str]) -> NoRet
     raise RigError(
         f"extrinsics unknown for {', '.join(missing)}; required for every sensor when there are "
         "two or more; give them in a rig file (--rig), /tf_static or metadata (ouster-sdk "
-        "extrinsic), or accept the body origin with --identity-extrinsics"
-        + (f" ({'; '.join(known)})" if known else "")
+        "extrinsic), measure them by mlbatch calibrate (without a guess: --from-motion), or accept "
+        "the body origin with --identity-extrinsics" + (f" ({'; '.join(known)})" if known else "")
     )

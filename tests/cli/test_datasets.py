@@ -175,7 +175,8 @@ def test_the_tables_of_the_page_are_those_of_the_recipes() -> None:
 
 
 def test_recipes_are_listed(shell: Shell) -> None:
-    table = shell("datasets").out.splitlines()
+    *table, use = shell("datasets").out.splitlines()
+    assert use == "mlbatch convert RECORDING --dataset NAME -o scans.mcap"
     assert [line.split()[0] for line in table] == ["name", *recipe_names()]
     assert "631 GB  " in table[1 + recipe_names().index("tiers")]
     listed = json.loads(shell("datasets --json").out)

@@ -523,7 +523,8 @@ def test_lidar_and_sensor_frame_give_the_same_pose(
 
 UNKNOWN = (
     "extrinsics unknown for left, right; required for every sensor when there are two or more; "
-    "give them in a rig file (--rig), /tf_static or metadata (ouster-sdk extrinsic), or accept the "
+    "give them in a rig file (--rig), /tf_static or metadata (ouster-sdk extrinsic), measure them "
+    "by mlbatch calibrate (without a guess: --from-motion), or accept the "
     "body origin with --identity-extrinsics"
 )
 RIGHT_UNKNOWN = UNKNOWN.replace("left, right", "right")
