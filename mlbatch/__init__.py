@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import sys
-from types import ModuleType
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from mlbatch.api import calibrate as calibrate
@@ -60,21 +58,6 @@ _PLACES = {
 }
 _OF_API = ("calibrate", "compare", "convert", "dataset", "extract", "inspect", "open", "read")
 _PLACES |= dict.fromkeys((*_OF_API, "report", "scans"), "mlbatch.api")
-
-
-class _Function(ModuleType):
-    """A package that has the name of a function of `mlbatch.api`, which a call of it calls."""
-
-    def __call__(self, *args: Any, **kwargs: Any) -> Any:
-        import importlib
-
-        api = importlib.import_module("mlbatch.api")
-        return getattr(api, self.__name__.rpartition(".")[2])(*args, **kwargs)
-
-
-def make_callable(package: str) -> None:
-    """Let `mlbatch.report(...)` call a function although `mlbatch.report` is a package."""
-    sys.modules[package].__class__ = _Function
 
 
 def __getattr__(name: str) -> object:

@@ -9,9 +9,9 @@ from datetime import date
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from mlbatch.compare.compare import Comparison, Settings
-from mlbatch.compare.compare import compare as compare_policies
-from mlbatch.compare.figures import check_figures, write_figures
+from mlbatch.comparison.compare import Comparison, Settings
+from mlbatch.comparison.compare import compare as compare_policies
+from mlbatch.comparison.figures import check_figures, write_figures
 from mlbatch.errors import UsageError
 from mlbatch.outputs.read import read as read_output
 from mlbatch.outputs.scan import Scan

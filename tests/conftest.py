@@ -99,7 +99,7 @@ SECONDS = (
     "cli/test_sort.py",
     "cli/test_tables.py",
     "cli/test_vendor_mistakes.py",
-    "compare/test_instant.py",
+    "comparison/test_instant.py",
     "contract/test_code.py::test_comments_name",
     "contract/test_docs.py::test_every_npz_key",
     "contract/test_help.py::test_a_shell_completes",

@@ -11,7 +11,7 @@ from mlbatch.batch.record import DONE, FAILED, KNOWN_BAD, SessionRecord, read_re
 from mlbatch.batch.session import LOG_TXT, STARTED_JSON, is_url
 from mlbatch.errors import RecordingError
 from mlbatch.outputs.run_files import SESSION_JSON
-from mlbatch.report.report import CUT_OFF
+from mlbatch.reports.report import CUT_OFF
 
 # Warnings of clocks, as in the page of a run.
 CLOCK_CODES = frozenset(

@@ -51,7 +51,7 @@ from mlbatch.errors import (
     one_line,
 )
 from mlbatch.outputs.run_files import SESSION_JSON
-from mlbatch.report.report import report_of
+from mlbatch.reports.report import report_of
 
 # Exit codes of `convert` that another attempt would not change, and that of a limit.
 _FINAL = (0, 1, 2, 3)

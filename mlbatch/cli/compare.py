@@ -18,7 +18,7 @@ from mlbatch.options import CLOCKS
 from mlbatch.units import NS_PER_S
 
 if TYPE_CHECKING:
-    from mlbatch.compare.compare import Comparison
+    from mlbatch.comparison.compare import Comparison
 
 
 def compare(
@@ -72,7 +72,7 @@ def compare(
     from mlbatch.cli.progress import progress_bar
     from mlbatch.cli.tables import paragraph, table_lines
     from mlbatch.cli.values import rate as read_rate
-    from mlbatch.compare.compare import Settings, compare
+    from mlbatch.comparison.compare import Settings, compare
     from mlbatch.discovery.discover import SensorSelection
     from mlbatch.page.policies import DEFAULT_MPS
     from mlbatch.pipeline.job import Job
@@ -99,7 +99,7 @@ def compare(
 
         check_page(html, overwrite=overwrite)
     if figures is not None:
-        from mlbatch.compare.figures import check_figures
+        from mlbatch.comparison.figures import check_figures
 
         check_figures(figures, overwrite=overwrite)
     with progress_bar("compare", is_verbose=verbose) as progress:
@@ -129,7 +129,7 @@ def compare(
 def _write_figures(found: Comparison, folder: Path | None) -> list[Path]:
     if folder is None:
         return []
-    from mlbatch.compare.figures import write_figures
+    from mlbatch.comparison.figures import write_figures
 
     return write_figures(folder, found.figures())
 

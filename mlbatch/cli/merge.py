@@ -38,7 +38,7 @@ def merge(
     from mlbatch.pipeline.interrupts import interruptible
     from mlbatch.pipeline.merge import merge as merge_parts
     from mlbatch.pipeline.merge import read_parts
-    from mlbatch.report.limits import exceeded, parse_limits
+    from mlbatch.reports.limits import exceeded, parse_limits
 
     limits = parse_limits(fail_on or ())
     command = shlex.join(["mlbatch", *sys.argv[1:]])

@@ -28,14 +28,14 @@ from mlbatch.pipeline.conversion import Conversion, Progress
 from mlbatch.pipeline.interrupts import interruptible
 from mlbatch.pipeline.job import Job, TimeSegment
 from mlbatch.pipeline.output import Output, OutputRequest
-from mlbatch.report.report import RunReport, report_of, report_text
+from mlbatch.reports.report import RunReport, report_of, report_text
 from mlbatch.writers import discard, report_paths
 
 # Loaded where it is needed: a dry run has no files.
 if TYPE_CHECKING:
     from mlbatch.pipeline.files import Files
     from mlbatch.pipeline.job import Shard
-    from mlbatch.report.limits import Limit
+    from mlbatch.reports.limits import Limit
 
 
 class Target(NamedTuple):
@@ -103,7 +103,7 @@ def _run_one(job: Job, target: Target) -> list[str]:
     if not target.limits:
         return []
     # Not loaded without limits.
-    from mlbatch.report.limits import exceeded, not_covered
+    from mlbatch.reports.limits import exceeded, not_covered
 
     for gap in not_covered(target.limits, report):
         say(f"limit not tested: {gap}")
@@ -130,7 +130,7 @@ def _beyond_limits_before(target: Target, name: str) -> list[str]:
     """One line per exceeded limit in the output of an earlier run; name: of the format."""
     if not target.limits or target.request.output is None:
         return []
-    from mlbatch.report.limits import exceeded
+    from mlbatch.reports.limits import exceeded
 
     path = target.request.report or report_paths(target.request.output, name).report
     try:

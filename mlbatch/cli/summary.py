@@ -9,7 +9,7 @@ import typer
 from mlbatch.cli import EXIT_LIMIT
 from mlbatch.cli.tables import paragraph, table_lines, terminal_width
 from mlbatch.errors import one_line
-from mlbatch.report.report import RunReport, summary_lines, summary_rows
+from mlbatch.reports.report import RunReport, summary_lines, summary_rows
 
 
 def say(text: str) -> None:

@@ -24,7 +24,7 @@ from mlbatch.writers import parse_jobs
 if TYPE_CHECKING:
     from mlbatch.faults import Fault
     from mlbatch.pipeline.job import Shard
-    from mlbatch.report.limits import Limit
+    from mlbatch.reports.limits import Limit
 
 
 def job_of(recordings: Sequence[Path], values: Mapping[str, Any]) -> Job:
@@ -95,7 +95,7 @@ def _fail_on(texts: Sequence[str], *, checks_poses: bool) -> tuple[Limit, ...]:
     if not texts:
         return ()
     # Not loaded without limits.
-    from mlbatch.report.limits import POSE, parse_limits
+    from mlbatch.reports.limits import POSE, parse_limits
 
     limits = parse_limits(texts)
     for limit in limits:

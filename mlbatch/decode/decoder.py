@@ -14,7 +14,7 @@ from mlbatch.arrays import F32Array, F64Array, U8Array
 from mlbatch.decode.engine import Engine
 from mlbatch.decode.scan_buffer import ScanBuffer, by_time
 from mlbatch.decode.source import Source
-from mlbatch.report.ledger import PointCounts
+from mlbatch.reports.ledger import PointCounts
 from mlbatch.types import (
     EXTRAS,
     NO_COLUMNS,

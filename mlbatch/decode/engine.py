@@ -16,7 +16,7 @@ from mlbatch.decode.scan_buffer import ScanBuffer
 from mlbatch.decode.source import Source
 from mlbatch.lidar.geometry import angles_rad, rotor_angles
 from mlbatch.native.library import Group, Scan, address, library
-from mlbatch.report.ledger import PointCounts
+from mlbatch.reports.ledger import PointCounts
 from mlbatch.types import PACKED_ROOM, PackedTotals, RecordLayout, WindowColumns
 
 _UNSURE = np.float32(2)

@@ -23,7 +23,7 @@ from mlbatch.lidar.geometry import (
 )
 from mlbatch.lidar.interface import BitField, Lidar, PixelTable, ReturnLayout
 from mlbatch.native.library import Field, Group, Ring, address
-from mlbatch.report.ledger import PointCounts
+from mlbatch.reports.ledger import PointCounts
 
 # As in `native.h`.
 TABLED, TURNING, PLACED, CORRECTED, MIRRORED, COORDINATES = range(6)

@@ -20,7 +20,7 @@ from mlbatch.outputs.read import read
 from mlbatch.outputs.run_files import RunFiles
 from mlbatch.outputs.scan import Scan
 from mlbatch.outputs.table import read_table
-from mlbatch.report.report import parse_report
+from mlbatch.reports.report import parse_report
 
 Values: TypeAlias = npt.NDArray[Any]
 

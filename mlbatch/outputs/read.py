@@ -26,7 +26,7 @@ from mlbatch.outputs.run_files import PIECES, RunFiles, inner_texts
 from mlbatch.outputs.scan import Scan
 from mlbatch.outputs.stored_scan import StoredScan
 from mlbatch.outputs.table import UNKNOWN, ScanRow, TableOfRun, read_table
-from mlbatch.report.report import RunReport, report_of
+from mlbatch.reports.report import RunReport, report_of
 from mlbatch.types import RunInfo, SensorInfo
 from mlbatch.units import NS_PER_S, parse_rate
 

@@ -27,7 +27,7 @@ from mlbatch.outputs.read import read
 from mlbatch.outputs.run_files import RunFiles
 from mlbatch.outputs.scan import Scan
 from mlbatch.readers import open_recording
-from mlbatch.report.report import RunReport, report_of
+from mlbatch.reports.report import RunReport, report_of
 from mlbatch.rig.rig import Rig, RigSensor, StreamSelector
 from mlbatch.ros.point_packets import HEAD, Layout, Points, layout_of, pack
 from mlbatch.types import (

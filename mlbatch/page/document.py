@@ -25,7 +25,7 @@ from mlbatch.page.source import Source
 from mlbatch.page.templates import Verdict, asset, page_json, render
 from mlbatch.page.windows import Windows, read_windows, summarise
 from mlbatch.page.words import COSTS, MEANINGS, SERVICES
-from mlbatch.report.report import RunReport, SensorReport, Unassigned
+from mlbatch.reports.report import RunReport, SensorReport, Unassigned
 from mlbatch.units import NS_PER_MS
 
 _WORDS = {

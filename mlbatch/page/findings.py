@@ -11,7 +11,7 @@ import numpy as np
 from mlbatch.arrays import BoolArray
 from mlbatch.page.windows import Windows
 from mlbatch.page.words import MEANINGS
-from mlbatch.report.report import RunReport
+from mlbatch.reports.report import RunReport
 
 _NETWORK = (
     "check network, switch and capture buffers (tcpdump -B, net.core.rmem_max), and the speed of "

@@ -10,7 +10,7 @@ from mlbatch.errors import ExportError, RecordingError, UsageError
 from mlbatch.outputs.folders import refuse_shard
 from mlbatch.outputs.kinds import REPORT
 from mlbatch.outputs.run_files import RunFiles
-from mlbatch.report.report import RunReport, report_of
+from mlbatch.reports.report import RunReport, report_of
 
 _REPORT_SUFFIX = f".{REPORT}"
 

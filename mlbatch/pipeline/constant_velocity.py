@@ -21,7 +21,7 @@ from mlbatch.motion.estimate import Estimate, VelocityEstimator
 from mlbatch.motion.moves import PoseLine
 from mlbatch.motion.registration import ORIGIN, ColumnCloud
 from mlbatch.motion.track import PoseTrack
-from mlbatch.report.motion import MotionLedger, VelocityCounts
+from mlbatch.reports.motion import MotionLedger, VelocityCounts
 from mlbatch.types import ImuSamples, Message, instant_ns
 from mlbatch.units import NS_PER_S
 

@@ -25,9 +25,9 @@ from mlbatch.pipeline.job import DEFAULT_RATE, Job, TimeSegment
 from mlbatch.pipeline.passthrough import Passthrough
 from mlbatch.pipeline.sensor import Sensor
 from mlbatch.pipeline.session import Session
-from mlbatch.report.ledger import PointCounts
-from mlbatch.report.poses import NOT_ASKED, ONE_LIDAR, PoseFigures
-from mlbatch.report.scan_table import ScanTable
+from mlbatch.reports.ledger import PointCounts
+from mlbatch.reports.poses import NOT_ASKED, ONE_LIDAR, PoseFigures
+from mlbatch.reports.scan_table import ScanTable
 from mlbatch.types import BYTE_INTENSITY, ImuSamples, Message, RunInfo, Scan, Topic
 from mlbatch.units import NS_PER_MS, NS_PER_S, rate_text
 

@@ -12,7 +12,7 @@ from isal.isal_zlib import crc32
 from mlbatch.arrays import I64Array
 from mlbatch.batching.windows import Window
 from mlbatch.decode.decoder import Decoder, ScanHeader, Source
-from mlbatch.report.ledger import PointCounts
+from mlbatch.reports.ledger import PointCounts
 from mlbatch.types import NO_COLUMNS, ColumnFigures, Scan, WindowColumns
 from mlbatch.writers.point_layouts import clipped_points
 

@@ -29,7 +29,7 @@ from mlbatch.pipeline.constant_velocity import WindowPoints
 from mlbatch.pipeline.passthrough import IMU_TYPE, NEAR_NS
 from mlbatch.pipeline.rotation_check import RotationCheck
 from mlbatch.pipeline.sensor import Sensor
-from mlbatch.report.motion import MotionLedger
+from mlbatch.reports.motion import MotionLedger
 from mlbatch.types import ImuSamples, Message, Topic, instant_ns
 from mlbatch.units import NS_PER_MS, NS_PER_S
 

@@ -29,8 +29,8 @@ from mlbatch.errors import ExportError, UsageError
 from mlbatch.outputs.table import read_table
 from mlbatch.pipeline.job import Job
 from mlbatch.pipeline.job_identity import difference, input_identity, job_identity
-from mlbatch.report.json_records import from_json, to_json
-from mlbatch.report.ledger import POINT_COUNTERS
+from mlbatch.reports.json_records import from_json, to_json
+from mlbatch.reports.ledger import POINT_COUNTERS
 from mlbatch.types import ImuSamples, Message, Scan
 from mlbatch.writers import (
     FILES_JSONL,

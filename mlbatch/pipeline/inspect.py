@@ -44,8 +44,8 @@ from mlbatch.pipeline.ingest import Ingest
 from mlbatch.pipeline.job import Job
 from mlbatch.pipeline.session import sensors_of
 from mlbatch.readers.bag.clouds import CloudRecording
-from mlbatch.report.json_records import to_json
-from mlbatch.report.poses import PoseFigures
+from mlbatch.reports.json_records import to_json
+from mlbatch.reports.poses import PoseFigures
 from mlbatch.rig.rig import (
     DEFAULT_BODY_FRAME,
     Rig,

@@ -24,8 +24,8 @@ from mlbatch.pipeline.files import records
 from mlbatch.pipeline.job_identity import difference
 from mlbatch.pipeline.run_report import point_notes, refuse_all_removed
 from mlbatch.pipeline.shards import Account, read_account
-from mlbatch.report.ledger import PointCounts
-from mlbatch.report.report import (
+from mlbatch.reports.ledger import PointCounts
+from mlbatch.reports.report import (
     RunReport,
     SensorReport,
     Timing,
@@ -33,7 +33,7 @@ from mlbatch.report.report import (
     imbalances,
     report_text,
 )
-from mlbatch.report.scan_table import ScanStatistics, merged_table
+from mlbatch.reports.scan_table import ScanStatistics, merged_table
 from mlbatch.writers import (
     FILES_JSONL,
     REPORT_JSON,

@@ -13,7 +13,7 @@ from mlbatch.pipeline import preflight
 from mlbatch.pipeline.conversion import Conversion, Progress
 from mlbatch.pipeline.job import Job
 from mlbatch.pipeline.run import convert
-from mlbatch.report.report import RunReport, report_text
+from mlbatch.reports.report import RunReport, report_text
 from mlbatch.types import RunInfo
 from mlbatch.writers import (
     FILES_JSONL,

@@ -27,7 +27,7 @@ from mlbatch.errors import ClockError, UsageError
 from mlbatch.pipeline.job import Job
 from mlbatch.pipeline.message_spill import Entry, MessageSpill
 from mlbatch.pipeline.sensor import Sensor
-from mlbatch.report.ledger import DecodedCounts
+from mlbatch.reports.ledger import DecodedCounts
 from mlbatch.types import IMU, MESSAGE_ENCODINGS, ImuSamples, Message, Recording, Topic
 from mlbatch.units import NS_PER_S
 

@@ -16,7 +16,7 @@ from mlbatch.arrays import F32Array, F64Array, I64Array, U8Array
 from mlbatch.decode.decoder import Decoder, ScanHeader
 from mlbatch.frames.transforms import from_rpy_deg
 from mlbatch.pipeline.sensor import Sensor
-from mlbatch.report.poses import PoseFigures
+from mlbatch.reports.poses import PoseFigures
 from mlbatch.units import NS_PER_S
 
 if TYPE_CHECKING:

@@ -22,7 +22,7 @@ from mlbatch.pipeline.decode_pool import DecodeTask, DecodeWorker
 from mlbatch.pipeline.job import Job
 from mlbatch.pipeline.scan_task import ScanTask, forward
 from mlbatch.pipeline.workers import OrderedWorkers, run_inline
-from mlbatch.report.report import RunReport, fill_totals, imbalances, report_text
+from mlbatch.reports.report import RunReport, fill_totals, imbalances, report_text
 from mlbatch.types import ImuSamples, Message, RunInfo, Summary
 from mlbatch.units import NS_PER_S
 from mlbatch.writers import FilesWriter, ScanJob, ScanWriter

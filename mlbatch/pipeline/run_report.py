@@ -18,8 +18,8 @@ from mlbatch.errors import NoScanError
 from mlbatch.pipeline.passthrough import PASS_REASONS
 from mlbatch.pipeline.sensor import Sensor
 from mlbatch.pipeline.session import CLOUDS
-from mlbatch.report.ledger import PointCounts, ordered
-from mlbatch.report.report import (
+from mlbatch.reports.ledger import PointCounts, ordered
+from mlbatch.reports.report import (
     CUT_OFF,
     ClockReport,
     FaultReport,
@@ -31,7 +31,7 @@ from mlbatch.report.report import (
     Unassigned,
     Warned,
 )
-from mlbatch.report.scan_table import ScanStatistics, Spread
+from mlbatch.reports.scan_table import ScanStatistics, Spread
 from mlbatch.types import CaptureCounts, CutOff, Recording
 from mlbatch.units import NS_PER_MS, NS_PER_S, rate_text
 

@@ -15,7 +15,7 @@ from mlbatch.decode.source import Source
 from mlbatch.discovery.types import DetectedSensor
 from mlbatch.lidar.interface import Lidar
 from mlbatch.native.arena import PacketArena
-from mlbatch.report.ledger import SensorLedger
+from mlbatch.reports.ledger import SensorLedger
 from mlbatch.rig.rig import RigSensor
 from mlbatch.types import StreamTable
 from mlbatch.units import NS_PER_S

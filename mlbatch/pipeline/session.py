@@ -24,7 +24,7 @@ from mlbatch.pipeline.ingest import Ingest
 from mlbatch.pipeline.job import Job, TimeSegment
 from mlbatch.pipeline.sensor import Limits, Sensor, SensorClock, new_ring
 from mlbatch.readers.source import BUFFER_BYTES
-from mlbatch.report.report import ACCEPTED_WARNINGS
+from mlbatch.reports.report import ACCEPTED_WARNINGS
 from mlbatch.rig.rig import Rig, RigSensor
 from mlbatch.types import PacketBatch, Recording, RunInfo, SensorInfo, StreamTable
 from mlbatch.units import NS_PER_S

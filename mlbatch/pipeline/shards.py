@@ -22,8 +22,8 @@ from mlbatch.errors import RecordingError, UsageError
 from mlbatch.pipeline.files import Files, records
 from mlbatch.pipeline.job import Shard
 from mlbatch.pipeline.job_identity import identity_of_parts
-from mlbatch.report.json_records import from_json, to_json
-from mlbatch.report.report import RunReport
+from mlbatch.reports.json_records import from_json, to_json
+from mlbatch.reports.report import RunReport
 from mlbatch.writers import (
     FILES_JSONL,
     SCANS_CSV,

@@ -29,7 +29,7 @@ from mlbatch.poses.solve import (
     solve,
 )
 from mlbatch.poses.surfaces import Planes, shared_cells
-from mlbatch.report.poses import (
+from mlbatch.reports.poses import (
     EXCHANGED,
     LIMIT_DEG,
     LIMIT_MM,

@@ -12,15 +12,15 @@ from mlbatch.outputs.scan import preformatted
 from mlbatch.pipeline.job import Job, check_max_bag_s
 from mlbatch.pipeline.output import Output, OutputRequest
 from mlbatch.python.options import OutputOptions, choice, names_of, path_of
-from mlbatch.report.ledger import SensorLedger
-from mlbatch.report.report import (
+from mlbatch.reports.ledger import SensorLedger
+from mlbatch.reports.report import (
     RunReport,
     Section,
     SensorReport,
     build_report,
     summary_lines,
 )
-from mlbatch.report.scan_table import ScanStatistics
+from mlbatch.reports.scan_table import ScanStatistics
 from mlbatch.writers import parse_jobs
 
 # Of the caller of `mlbatch.convert`, as calls above that of `warnings.warn`.

@@ -20,7 +20,7 @@ from mlbatch.arrays import I64Array
 from mlbatch.clocks.timescale import TAI, UTC
 from mlbatch.errors import ExportError, UsageError, one_line
 from mlbatch.motion.se3 import rotated
-from mlbatch.report.map_figures import MapFigures
+from mlbatch.reports.map_figures import MapFigures
 from mlbatch.types import RunInfo, Scan, Summary
 from mlbatch.units import NS_PER_S
 from mlbatch.writers.atomic import export_errors, prepare

@@ -24,7 +24,7 @@ from mlbatch.pipeline.job import Job
 from mlbatch.pipeline.run import convert
 from mlbatch.readers import open_recording
 from mlbatch.readers.capture.recording import CaptureRecording
-from mlbatch.report.report import RunReport
+from mlbatch.reports.report import RunReport
 from mlbatch.types import (
     EXTRAS,
     IMU,

@@ -11,7 +11,7 @@ import pytest
 from mcap.reader import make_reader
 
 import mlbatch
-from mlbatch.compare.compare import compare
+from mlbatch.comparison.compare import compare
 from mlbatch.pipeline.job import Job
 from tests.builders.phases import CASES, write_case
 from tests.builders.sessions import FIXTURE, Shell, arrays, names, report_of

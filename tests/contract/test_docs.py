@@ -26,8 +26,8 @@ from mlbatch.pipeline.run import convert
 from mlbatch.readers import readers, source
 from mlbatch.readers.bag import recording as bag_recording
 from mlbatch.readers.capture import recording as capture
-from mlbatch.report import ledger
-from mlbatch.report.report import build_report
+from mlbatch.reports import ledger
+from mlbatch.reports.report import build_report
 from mlbatch.rig import yaml_tree
 from mlbatch.ros.packet_types import PACKET_TYPES
 from mlbatch.sensors import MAX_CALIBRATION_BYTES, models

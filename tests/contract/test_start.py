@@ -47,7 +47,7 @@ NEEDLESS = (
     *("mlbatch.readers.formats.pcapng", "mlbatch.readers.formats.rosbag1"),
     *("mlbatch.readers.bag.recording", "mlbatch.readers.bag.packet_messages"),
     *("mlbatch.readers.bag.folder", "mlbatch.readers.bag.clouds", "mlbatch.faults.replay"),
-    *("mlbatch.frames.urdf", "mlbatch.pipeline.inspect", "mlbatch.compare.compare"),
+    *("mlbatch.frames.urdf", "mlbatch.pipeline.inspect", "mlbatch.comparison.compare"),
     *("mlbatch.verification.verdict", "mlbatch.api"),
     *("mlbatch.writers.formats.npz", "mlbatch.writers.formats.ply"),
     *("mlbatch.writers.formats.rosbag1", "mlbatch.cli.compare"),
@@ -61,7 +61,7 @@ NEEDLESS = (
     *("numpy.ma", "rosbags", "rich", "mcap.writer", "importlib.metadata"),
     *("mlbatch.readers.capture.odd", "dpkt", "mlbatch.page.templates", "jinja2"),
     *("mlbatch.sensors.advice", "mlbatch.pipeline.segments", "mlbatch.pipeline.time_limits"),
-    *("mlbatch.report.limits", "mlbatch.pipeline.overlap", "mlbatch.discovery.overlap"),
+    *("mlbatch.reports.limits", "mlbatch.pipeline.overlap", "mlbatch.discovery.overlap"),
 )
 
 
@@ -157,7 +157,7 @@ def test_a_capture_of_four_vendors_loads_all_of_them() -> None:
 OF_A_RUN = (
     *("numpy", "yaml", "mcap", "rosbags", "zstandard", "lz4", "ctypes", "importlib.metadata"),
     *("mlbatch.types", "mlbatch.rig", "mlbatch.sensors", "mlbatch.readers", "mlbatch.writers"),
-    *("mlbatch.pipeline", "mlbatch.discovery", "mlbatch.report", "mlbatch.cli.run"),
+    *("mlbatch.pipeline", "mlbatch.discovery", "mlbatch.reports", "mlbatch.cli.run"),
 )
 
 

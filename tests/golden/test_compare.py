@@ -11,8 +11,8 @@ from pathlib import Path
 
 import pytest
 
-from mlbatch.compare.compare import WINDOWS, Comparison, compare
-from mlbatch.compare.statistics import SetReport
+from mlbatch.comparison.compare import WINDOWS, Comparison, compare
+from mlbatch.comparison.statistics import SetReport
 from mlbatch.pipeline.job import Job
 from tests.builders.phases import CASES, slug, write_case
 

@@ -12,7 +12,7 @@ import pytest
 import mlbatch
 from mlbatch.errors import MlbatchError
 from mlbatch.outputs.scan import Scan
-from mlbatch.report.report import report_of
+from mlbatch.reports.report import report_of
 from tests.builders.sessions import Shell
 from tests.contract.tree import ROOT
 

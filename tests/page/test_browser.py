@@ -14,7 +14,7 @@ import numpy.typing as npt
 import pytest
 
 from mlbatch.page import Source, write_page
-from mlbatch.report.report import RunReport
+from mlbatch.reports.report import RunReport
 from tests.builders.sessions import FIXTURE
 from tests.contract.tree import run_mlbatch
 from tests.page.browser import CHROMIUM, NO_CHROMIUM, Browser, browser

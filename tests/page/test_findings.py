@@ -9,7 +9,7 @@ import pytest
 
 from mlbatch.page.findings import REMEDIES, Level, findings, percent, verdict
 from mlbatch.page.windows import read_windows
-from mlbatch.report.report import RunReport
+from mlbatch.reports.report import RunReport
 from tests.contract.tree import PACKAGE, ROOT
 from tests.page.runs import report, sensor, table
 

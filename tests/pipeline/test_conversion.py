@@ -19,7 +19,7 @@ from mlbatch.pipeline.conversion import Conversion
 from mlbatch.pipeline.job import Job, wait_ns
 from mlbatch.pipeline.passthrough import ImuQueue
 from mlbatch.pipeline.run import convert
-from mlbatch.report.report import RunReport
+from mlbatch.reports.report import RunReport
 from mlbatch.types import EXTRAS, IMU, RunInfo, Scan
 from tests.builders.run import FIXTURE, TWO_LIDARS, Memory, in_memory
 from tests.builders.sessions import EPOCH_NS, NS_PER_MS, NS_PER_S, Unit, twin, write_session

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from mlbatch.errors import ExportError
 from mlbatch.pipeline import message_spill, passthrough
 from mlbatch.pipeline.passthrough import ImuQueue, MessageQueue
-from mlbatch.report.ledger import DecodedCounts
+from mlbatch.reports.ledger import DecodedCounts
 from mlbatch.types import ImuSamples, Message, Topic
 
 TOPICS = tuple(Topic(name, "std_msgs/String", "cdr", "") for name in ("/b", "/a"))

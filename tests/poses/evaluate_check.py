@@ -24,7 +24,7 @@ from mlbatch.motion.se3 import exp_rotation
 from mlbatch.pipeline.conversion import Conversion
 from mlbatch.pipeline.job import Job
 from mlbatch.pipeline.time_limits import limits_of
-from mlbatch.report.poses import PoseFigures
+from mlbatch.reports.poses import PoseFigures
 
 FAULTS = ("", "drop:*:5%", "reorder:*:3%", "dup:*:2%", "bitflip:*:1%", "truncate:*:1%")
 STEP_S, RUN_S = 0.2, 1.8

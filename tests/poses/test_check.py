@@ -12,7 +12,7 @@ import pytest
 import yaml
 
 import mlbatch
-from mlbatch.report.poses import (
+from mlbatch.reports.poses import (
     EXCHANGED,
     MEASURED,
     MISFIT,
@@ -24,7 +24,7 @@ from mlbatch.report.poses import (
     PairFigures,
     PoseFigures,
 )
-from mlbatch.report.report import RunReport
+from mlbatch.reports.report import RunReport
 from tests.builders.run import command
 from tests.contract.tree import ROOT
 

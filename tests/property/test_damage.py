@@ -23,7 +23,7 @@ import pytest
 from mlbatch.discovery.discover import SensorSelection
 from mlbatch.errors import MlbatchError
 from mlbatch.pipeline.job import Job
-from mlbatch.report.report import RunReport, build_report
+from mlbatch.reports.report import RunReport, build_report
 from mlbatch.types import Scan
 from tests.builders.captures import pcap_bytes
 from tests.builders.run import (

@@ -98,14 +98,6 @@ def test_pages_by_functions_with_the_names_of_packages(tmp_path: Path) -> None:
     assert (tmp_path / "c.html").exists()
     with pytest.raises(UsageError, match="tolerance: expected"):
         mlbatch.compare(CAPTURE, tolerance=0)
-    # Before and after their packages are imported.
-    printed = run_python(
-        "import mlbatch\n"
-        "first = callable(mlbatch.report), callable(mlbatch.compare)\n"
-        "import mlbatch.report.report, mlbatch.compare.compare\n"
-        "print(*first, callable(mlbatch.report), callable(mlbatch.compare))"
-    )
-    assert printed.split() == ["True"] * 4
 
 
 def test_paths_are_checked_at_the_call(tmp_path: Path) -> None:

@@ -13,7 +13,7 @@ import pytest
 from mlbatch.readers import merge, open_recording
 from mlbatch.readers.bag.cloud_topics import CloudTopics, cloud_topics
 from mlbatch.readers.bag.clouds import CloudRecording
-from mlbatch.report.ledger import check_capture
+from mlbatch.reports.ledger import check_capture
 from mlbatch.types import PacketBatch, Stream, StreamTable, Topic
 from tests.builders.bags import Body, Recorded, packet_message
 from tests.builders.engines import needs_native

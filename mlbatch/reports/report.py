@@ -12,8 +12,8 @@ import mlbatch
 from mlbatch.arrays import F64Array
 from mlbatch.bounded import parse_json
 from mlbatch.errors import RecordingError
-from mlbatch.report.json_records import from_json, to_json
-from mlbatch.report.ledger import (
+from mlbatch.reports.json_records import from_json, to_json
+from mlbatch.reports.ledger import (
     CAPTURE_REASONS,
     COLUMN_REASONS,
     IMU_REASONS,
@@ -25,10 +25,10 @@ from mlbatch.report.ledger import (
     check_messages,
     ordered,
 )
-from mlbatch.report.map_figures import MapFigures
-from mlbatch.report.motion import MotionLedger
-from mlbatch.report.poses import PoseFigures
-from mlbatch.report.scan_table import ScanStatistics
+from mlbatch.reports.map_figures import MapFigures
+from mlbatch.reports.motion import MotionLedger
+from mlbatch.reports.poses import PoseFigures
+from mlbatch.reports.scan_table import ScanStatistics
 from mlbatch.types import VARIANTS, CaptureCounts
 from mlbatch.units import NS_PER_S
 

@@ -13,8 +13,8 @@ import pytest
 
 import mlbatch
 from mlbatch.arrays import F32Array, F64Array, U8Array
-from mlbatch.compare.compare import WINDOWS, Comparison, compare
-from mlbatch.compare.places import apart, cells, difference
+from mlbatch.comparison.compare import WINDOWS, Comparison, compare
+from mlbatch.comparison.places import apart, cells, difference
 from mlbatch.discovery.discover import SensorSelection
 from mlbatch.page.instant import InstantSet, SetPoints, SharedInstant
 from mlbatch.pipeline.job import Job

@@ -1,5 +1,1 @@
 """Packet, column and point accounting; report.json, scans.csv and the summary."""
-
-from mlbatch import make_callable
-
-make_callable(__name__)

@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 
 from mlbatch.errors import UsageError
-from mlbatch.report.limits import exceeded, not_covered, parse_limits
-from mlbatch.report.report import RunReport
+from mlbatch.reports.limits import exceeded, not_covered, parse_limits
+from mlbatch.reports.report import RunReport
 
 REPORT = RunReport.from_json(
     {

@@ -2,7 +2,3 @@
 
 statistics.py measures sets of sweeps (batching/sweeps.py), compare.py runs both.
 """
-
-from mlbatch import make_callable
-
-make_callable(__name__)

@@ -24,7 +24,7 @@ from mlbatch.batching.sweeps import (
     sweeps_of,
 )
 from mlbatch.batching.windows import Window
-from mlbatch.compare.statistics import HEAD, Distribution, SetReport, SetStatistics
+from mlbatch.comparison.statistics import HEAD, Distribution, SetReport, SetStatistics
 from mlbatch.discovery.types import Note
 from mlbatch.errors import RecordingError
 from mlbatch.page.policies import PolicyFigures
@@ -35,7 +35,7 @@ from mlbatch.pipeline.sensor import Sensor
 from mlbatch.units import NS_PER_MS, NS_PER_S, rate_text
 
 if TYPE_CHECKING:
-    from mlbatch.compare.instant import InstantFinder
+    from mlbatch.comparison.instant import InstantFinder
     from mlbatch.page.instant import SharedInstant
 
 SCHEMA = "mlbatch.compare/2"
@@ -195,7 +195,7 @@ def compare(
     finder = None
     if finds_instant:
         # Not loaded for figures alone.
-        from mlbatch.compare.instant import InstantFinder
+        from mlbatch.comparison.instant import InstantFinder
 
         names = [*(policy.name for policy in policies), WINDOWS]
         finder = InstantFinder(names, run.sensors, period_ns, run.plain_decoder)

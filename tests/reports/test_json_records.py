@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from mlbatch.arrays import F64Array
-from mlbatch.report.json_records import from_json, to_json
+from mlbatch.reports.json_records import from_json, to_json
 
 
 class Inner(NamedTuple):

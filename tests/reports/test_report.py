@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 
 from mlbatch.errors import RecordingError
-from mlbatch.report.ledger import SensorLedger, check_capture
-from mlbatch.report.report import (
+from mlbatch.reports.ledger import SensorLedger, check_capture
+from mlbatch.reports.report import (
     ClockReport,
     ForwardedMessages,
     InputReport,
@@ -27,7 +27,7 @@ from mlbatch.report.report import (
     report_text,
     summary_lines,
 )
-from mlbatch.report.scan_table import ScanTable
+from mlbatch.reports.scan_table import ScanTable
 from mlbatch.types import CaptureCounts
 from tests.builders.scans import PERIOD_NS, START_NS, dense_scan, run_info
 

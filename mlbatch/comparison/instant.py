@@ -16,7 +16,7 @@ from mlbatch.arrays import BoolArray
 from mlbatch.batching.fusion import MOST_AGE_NS
 from mlbatch.batching.sweeps import Sweep, SweepSet, sweeps_of
 from mlbatch.batching.windows import Window
-from mlbatch.compare.places import apart, cells, difference, spot_apart_ms
+from mlbatch.comparison.places import apart, cells, difference, spot_apart_ms
 from mlbatch.decode.decoder import Decoder, ScanHeader
 from mlbatch.page.instant import InstantSet, SetPoints, SharedInstant, Spot
 from mlbatch.pipeline.sensor import Sensor

@@ -8,8 +8,8 @@ from functools import partial
 from typing import NamedTuple, TypeAlias
 
 from mlbatch.errors import UsageError
-from mlbatch.report.poses import MISFIT
-from mlbatch.report.report import ACCEPTED_WARNINGS, CUT_OFF, RunReport
+from mlbatch.reports.poses import MISFIT
+from mlbatch.reports.report import ACCEPTED_WARNINGS, CUT_OFF, RunReport
 
 # A part and the whole that it is a share of; 0: it is a share of nothing.
 Amount: TypeAlias = tuple[int, int]
