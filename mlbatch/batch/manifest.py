@@ -301,7 +301,8 @@ def _limits(node: Node, known: Limits, given: Limits) -> Limits:
     """Limits of a manifest: over those known before, below those of the command line."""
     entries = node.fields(_LIMIT_KEYS)
     time, disk = (_text(entries[key]) if key in entries else None for key in _LIMIT_KEYS)
-    found = read_limits(time, disk, node.place)
+    of_time, of_disk = (entries.get(key, node).place for key in _LIMIT_KEYS)
+    found = read_limits(time, disk, (of_time, of_disk))
     return Limits(
         given.time_s or found.time_s or known.time_s,
         given.disk_bytes or found.disk_bytes or known.disk_bytes,

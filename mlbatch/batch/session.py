@@ -115,11 +115,12 @@ _TIME_UNITS = {"s": 1.0, "min": 60.0, "h": 3600.0}
 _DISK_UNITS = {"MB": 1e6, "GB": 1e9, "TB": 1e12}
 
 
-def read_limits(time: str | None, disk: str | None, where: str) -> Limits:
-    """Limits as written: `90 min` and `50 GB`; UsageError with the place otherwise."""
+def read_limits(time: str | None, disk: str | None, places: tuple[str, str]) -> Limits:
+    """Limits as written: `90 min` and `50 GB`; places: of both, for a UsageError."""
+    of_time, of_disk = places
     return Limits(
-        None if time is None else _amount(time, _TIME_UNITS, "2 h, 90 min or 30 s", where),
-        None if disk is None else _amount(disk, _DISK_UNITS, "50 GB, 500 MB or 1.5 TB", where),
+        None if time is None else _amount(time, _TIME_UNITS, "2 h, 90 min or 30 s", of_time),
+        None if disk is None else _amount(disk, _DISK_UNITS, "50 GB, 500 MB or 1.5 TB", of_disk),
     )
 
 

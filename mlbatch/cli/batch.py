@@ -114,7 +114,7 @@ def batch(
         say("--cache-gb is ignored, since copies are removed when their session has ended")
     jobs = _jobs(jobs, workers)
     numbers = parse_part(part)
-    limits = read_limits(time_limit, disk_limit, "--time-limit, --disk-limit")
+    limits = read_limits(time_limit, disk_limit, ("--time-limit", "--disk-limit"))
     if dataset is not None:
         from mlbatch.rig.recipes import rig_of
 

@@ -11,11 +11,16 @@ from mlbatch.pipeline.job import Job
 from mlbatch.writers.map_writer import UNITS_PER_M
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from mlbatch.pipeline.output import OutputRequest
 
 
-def check_map(job: Job, request: OutputRequest) -> None:
-    """Raise UsageError for options that contradict a map, ExportError for one over an input."""
+def check_map(job: Job, request: OutputRequest, output: Path | None) -> None:
+    """Raise UsageError for options that contradict a map, ExportError for one over an input.
+
+    output: that of the scans, as given.
+    """
     path = request.accumulate
     if path is None:
         option = "--crs" if request.voxel is None else "--voxel"
@@ -30,7 +35,8 @@ def check_map(job: Job, request: OutputRequest) -> None:
         ("--shard, since a map needs all scans in order", job.shard is not None),
         ("--batching-times own, since points of a map have one clock", job.batching_times == OWN),
         ("--split, since a map is of all lidars", job.split),
-        ("--report of the same name", request.report == path),
+        ("--report of the same name", _are_one(request.report, path)),
+        ("-o of the same name", _are_one(output, path)),
         ("--layout organized, since a map has no empty slots", job.layout == "organized"),
     ):
         if is_given:
@@ -41,3 +47,7 @@ def check_map(job: Job, request: OutputRequest) -> None:
         raise UsageError(f"{text}; write --voxel 0.1")
     if not request.dry_run:
         preflight.check_output(job, path, None)
+
+
+def _are_one(one: Path | None, other: Path) -> bool:
+    return one is not None and one.absolute() == other.absolute()

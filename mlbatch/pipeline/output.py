@@ -113,7 +113,7 @@ class Output:
         if (request.accumulate, request.voxel, request.crs) != (None, None, None):
             from mlbatch.pipeline.accumulate import check_map
 
-            check_map(job, request)
+            check_map(job, request, only or request.written)
         path = request.written
         jobs = request.jobs or 1 if path is None else jobs_for(request.jobs, self.format, options)
         self.job = replace(job, extras=extras(self.format, options), jobs=jobs)

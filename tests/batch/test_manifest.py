@@ -211,7 +211,10 @@ MISTAKES = {
         "name of session b7",
     ),
     "no rule fits": (f"rigs: [{{sessions: a*, rig: a.yaml}}]\n{ONE}", "no rule that fits it"),
-    "a limit without a unit": (f"limits: {{time: 30}}\n{ONE}", "2 h, 90 min or 30 s, found '30'"),
+    "a limit without a unit": (
+        f"limits: {{time: 30}}\n{ONE}",
+        "limits.time: expected a limit as 2 h, 90 min or 30 s",
+    ),
     "a limit of nothing": (f"limits: {{disk: 0 GB}}\n{ONE}", "50 GB"),
     "bad without a reason": (f"known_bad: [b7]\n{ONE}", "sessions with reasons"),
     "an unknown bad one": (f"known_bad: {{b8: rain}}\n{ONE}", "name of a session, found 'b8'"),

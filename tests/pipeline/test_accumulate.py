@@ -276,3 +276,10 @@ def test_float32_keeps_millimetres(drive: Drive, tmp_path: Path) -> None:
     poses.write_text("\n".join([*rows[:middle], *far]))
     with pytest.raises(ExportError, match="below 16384 m from its offset, found 200"):
         drive.convert(None, tmp_path / "map.pcd", deskew=poses)
+
+
+@pytest.mark.parametrize("name", ["one.ply", "one.laz"])
+def test_a_map_is_not_written_over_the_scans(drive: Drive, tmp_path: Path, name: str) -> None:
+    with pytest.raises(UsageError, match="expected no -o of the same name, found both"):
+        drive.convert(tmp_path / name, tmp_path / name)
+    assert list(tmp_path.iterdir()) == []
