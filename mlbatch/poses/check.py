@@ -249,6 +249,9 @@ class PoseComparison:
         """Match surfaces anew where something seems to be off: one linear step may be too short."""
         if self._joined is None or not (self._is_misfit or _seems_off(self._joined)):
             return
+        if all(self._is_far_off(pair) for pair in self._pairs.values() if pair.both):
+            # What does not fit at all is not measured.
+            return
         problem, level = Problem(self._places, len(self._names)), self._level[0]
         if self._is_misfit:
             self._state = solve(problem, self._state, _COARSE, _STEPS).state
@@ -299,7 +302,7 @@ class PoseComparison:
         )
         if pair.both < _LEAST_SURFACES * min(self.places, _LEAST_PLACES):
             return figures._replace(reason=f"they have only {pair.both} surfaces in common")
-        if pair.fit < _MISFIT * pair.both and self.places >= _LEAST_PLACES:
+        if self._is_far_off(pair):
             return figures._replace(outcome=MISFIT)
         if joined is None:
             return figures._replace(reason="what they see in common determines no direction")
@@ -325,6 +328,10 @@ class PoseComparison:
                 *(f"turn about {axis}" for axis in turn.undetermined),
             ),
         )
+
+    def _is_far_off(self, pair: _Pair) -> bool:
+        """Whether so few surfaces fit that the poses cannot be measured."""
+        return pair.fit < _MISFIT * pair.both and self.places >= _LEAST_PLACES
 
     def _part(self, key: tuple[int, int], joined: _Estimate, *, turn: bool) -> _Part:
         """Shift or turn of the second lidar of a pair, at its place."""
