@@ -1,23 +1,20 @@
-"""Programs that are measured for comparison, each in a process of its own: floors and peers.
+"""Programs that are measured for comparison, each in a process of its own.
 
-    python -m tests.bench.programs FLOOR RESULT BYTES MESSAGES
-
-runs a floor: work that no conversion avoids (`copy`, `write`, `start`), or a library (`mcap`). A
-peer is another program that does a part of the same work; peers.py passes this file as text to
-the interpreter that has it installed:
-
-    python -c TEXT ouster-sdk|ouster-sdk-lean|ouster-cli RESULT RECORDING METADATA,X,Y,Z,YAW_DEG...
+    python -c TEXT start RESULT
+    python -c TEXT write RESULT BYTES
+    python -c TEXT ouster-sdk|ouster-sdk-lean RESULT RECORDING METADATA,X,Y,Z,YAW_DEG...
     python -c TEXT velodyne-decoder|velodyne-decoder-lean RESULT RECORDING MODEL...
 
-RESULT is a JSON file: CPU time without start and imports, and what was read. This file imports
-only the standard library at the top, and nothing of mlbatch: imports count in what is measured.
+The first two do work that no conversion avoids; a peer is another program that does a part of the
+same work. TEXT is that of this file, which the interpreter that has a peer gets. RESULT is a JSON
+file: CPU time without start and imports, and what was read. This file imports only the standard
+library at the top, and nothing of mlbatch: imports count in what is measured.
 
 Source: the APIs of ouster-sdk 1.0 and velodyne-decoder 3.1 (both BSD-3-Clause).
 """
 
 from __future__ import annotations
 
-import contextlib
 import importlib
 import json
 import struct
@@ -49,64 +46,25 @@ _LEAN_FIELDS: Final = {
     "RNG19_RFL8_SIG16_NIR16": ["RANGE", "REFLECTIVITY", "SIGNAL"],
 }
 
+Counts: TypeAlias = "dict[str, float]"
+
 # -- floors ---------------------------------------------------------------------------------------
 
 
-def copy(size: int, messages: int) -> None:
-    """Copy `size` bytes, one message at a time, between two warm buffers."""
-    message_bytes = max(1, size // messages)
-    source = memoryview(bytes(message_bytes))
-    target = memoryview(bytearray(message_bytes))
-    for _ in range(messages):
-        target[:] = source
-
-
-def write(size: int, messages: int) -> None:
-    """Write `size` bytes to a new file in large blocks; like mlbatch, without fsync."""
+def write(size: str) -> Counts:
+    """Write bytes to a new file in large blocks; like mlbatch, without fsync."""
+    began_s = time.process_time()
     block = memoryview(bytes(range(256)) * (BLOCK_BYTES // 256))
     with Path("floor.bin").open("wb", buffering=0) as file:
-        for at in range(0, size, BLOCK_BYTES):
-            file.write(block[: min(BLOCK_BYTES, size - at)])
+        for at in range(0, int(size), BLOCK_BYTES):
+            file.write(block[: min(BLOCK_BYTES, int(size) - at)])
+    return {"own_cpu_s": time.process_time() - began_s}
 
 
-def mcap_library(size: int, messages: int) -> None:
-    """Write messages of equal size by the `mcap` library, one chunk with a CRC per message."""
-    from mcap.writer import CompressionType, Writer
-
-    message = bytes(range(256)) * max(1, size // messages // 256)
-    with Path("floor.mcap").open("wb") as file:
-        writer = Writer(file, len(message), compression=CompressionType.NONE)
-        writer.start("ros2")
-        schema = writer.register_schema("sensor_msgs/msg/PointCloud2", "ros2msg", b"uint8[] data")
-        channel = writer.register_channel("/points", "cdr", schema)
-        for number in range(messages):
-            writer.add_message(channel, number, message, number)
-        finish: Callable[[], None] = writer.finish
-        finish()
-
-
-def start(size: int, messages: int) -> None:
+def start() -> Counts:
     """Import numpy, as every conversion does."""
     importlib.import_module("numpy")
-
-
-FLOORS: Final[Mapping[str, Callable[[int, int], None]]] = {
-    "copy": copy,
-    "write": write,
-    "mcap": mcap_library,
-    "start": start,
-}
-
-
-def run_floor(name: str, size: str, messages: str) -> dict[str, float]:
-    """CPU and wall time of a floor, in s."""
-    began_wall_s = time.perf_counter()
-    began_cpu_s = time.process_time()
-    FLOORS[name](int(size), max(1, int(messages)))
-    return {
-        "own_cpu_s": time.process_time() - began_cpu_s,
-        "wall_s": time.perf_counter() - began_wall_s,
-    }
+    return {"own_cpu_s": 0.0}
 
 
 # -- peers ----------------------------------------------------------------------------------------
@@ -121,7 +79,7 @@ def _body_from_sensor(x: float, y: float, z: float, yaw_deg: float) -> npt.NDArr
     return np.array([[cosine, -sine, 0, x], [sine, cosine, 0, y], [0, 0, 1, z], [0, 0, 0, 1]])
 
 
-def ouster_sdk(recording: str, *sensors: str, lean: bool) -> dict[str, float]:
+def ouster_sdk(recording: str, *sensors: str, lean: bool) -> Counts:
     """Collate the frames of all sensors and project them into the body frame.
 
     By default all fields and `XYZLut` (float64) with extrinsics, as the SDK does; lean: only the
@@ -155,30 +113,6 @@ def ouster_sdk(recording: str, *sensors: str, lean: bool) -> dict[str, float]:
                 points += int(np.count_nonzero(frame.field("RANGE")))
     own_cpu_s = time.process_time() - began_s
     return {"slots": slots, "points": points, "scans": scans, "own_cpu_s": own_cpu_s}
-
-
-def ouster_cli(recording: str, *sensors: str) -> dict[str, float]:
-    """Write one PLY file of all points, in sensor frames, by the command line of the SDK."""
-    cli = importlib.import_module("ouster.cli.core")
-    began_s = time.process_time()
-    metadata = [part for sensor in sensors for part in ("--meta", sensor.split(",")[0])]
-    sys.argv = ["ouster-cli", "source", *metadata, recording]
-    sys.argv += ["save", "--decimate", "false", "peer.ply"]
-    # The command line ends with sys.exit().
-    with contextlib.suppress(SystemExit):
-        cli.run()
-    own_cpu_s = time.process_time() - began_s
-    points = 0
-    size = 0
-    for path in Path().glob("peer*.ply"):
-        with path.open("rb") as file:
-            points += next(int(line.split()[2]) for line in file if b"element vertex" in line)
-        size += path.stat().st_size
-        path.unlink()
-    if not points:
-        raise RuntimeError("expected points in the PLY file of ouster-cli, found none")
-    counts = {"slots": points, "points": points, "scans": 1, "written_bytes": size}
-    return {**counts, "own_cpu_s": own_cpu_s}
 
 
 class _SweepDecoder(Protocol):
@@ -219,7 +153,7 @@ def _packets_at_offsets(recording: str) -> Iterator[_VelodynePacket]:
         at += kept
 
 
-def velodyne_decoder(recording: str, *models: str, lean: bool) -> dict[str, float]:
+def velodyne_decoder(recording: str, *models: str, lean: bool) -> Counts:
     """Decode the sweeps of each sensor in its own frame, without merging sensors.
 
     Packets come from dpkt, as in the decoder's `read_pcap`, which supports one sensor per file;
@@ -247,11 +181,11 @@ def velodyne_decoder(recording: str, *models: str, lean: bool) -> dict[str, floa
     return {"slots": slots, "points": sum(sweeps), "scans": len(sweeps), "own_cpu_s": own_cpu_s}
 
 
-PROGRAMS: Final[Mapping[str, Callable[..., dict[str, float]]]] = {
-    **{name: partial(run_floor, name) for name in FLOORS},
+PROGRAMS: Final[Mapping[str, Callable[..., Counts]]] = {
+    "start": start,
+    "write": write,
     "ouster-sdk": partial(ouster_sdk, lean=False),
     "ouster-sdk-lean": partial(ouster_sdk, lean=True),
-    "ouster-cli": ouster_cli,
     "velodyne-decoder": partial(velodyne_decoder, lean=False),
     "velodyne-decoder-lean": partial(velodyne_decoder, lean=True),
 }

@@ -34,24 +34,23 @@ from mlbatch.units import NS_PER_MS, NS_PER_S, NS_PER_US, STANDARD_GRAVITY
 from mlbatch.writers.recordings import McapFile
 from tests.bench.cases import (
     BY_RING,
-    CLOUD_COLUMNS,
-    CLOUD_RINGS,
-    DIGEST,
-    FULL,
-    KINDS,
-    LOW,
+    OUSTER,
     RECORDINGS,
     RIG,
     BenchRecording,
     BenchSensor,
-    digest,
 )
 from tests.builders.captures import udp_frame, write_pcap
-from tests.builders.points import CLOUD, OUSTER, Form, cloud_message
+from tests.builders.points import CLOUD, Form, cloud_message
+from tests.builders.points import OUSTER as OUSTER_POINTS
 
 # Time of the first shot.
 EPOCH_NS: Final = 1_700_000_000 * NS_PER_S
 REVOLUTION_NS: Final = 100 * NS_PER_MS
+# Legacy IMU packets of an Ouster.
+IMU_PER_S: Final = 100
+CLOUD_RINGS: Final = 64
+CLOUD_COLUMNS: Final = 2048
 ETHERNET_MTU: Final = 1500
 _RECEIVER: Final = "192.168.7.2"
 # From the last shot of a packet to its capture, and from the last point of a cloud to its message.
@@ -84,7 +83,7 @@ def scene(columns: int, channels: int) -> tuple[F64Array, F64Array]:
 
 def _lidar(sensor: BenchSensor) -> SimulatedLidar:
     """A lidar at 10 Hz with one return; Ouster: OS1-128 at 1024x10."""
-    is_ouster = sensor.kind in (LOW, FULL)
+    is_ouster = sensor.kind in OUSTER
     return simulated_lidar(
         LidarSettings(
             model="OS1-128" if is_ouster else sensor.kind,
@@ -111,11 +110,11 @@ def _lidar_packets(lidar: SimulatedLidar) -> Iterator[Sent]:
         yield from (one for one in sent if one.port in lidar.topics)
 
 
-def _imu_packets(lidar: SimulatedLidar, begin_ns: int, rate_hz: int) -> Iterator[Sent]:
+def _imu_packets(lidar: SimulatedLidar, begin_ns: int) -> Iterator[Sent]:
     """Packets of an IMU at rest without end."""
     up = np.array([[0.0, 0.0, STANDARD_GRAVITY]])
     for number in itertools.count(1):
-        at_ns = np.array([begin_ns + number * NS_PER_S // rate_hz])
+        at_ns = np.array([begin_ns + number * NS_PER_S // IMU_PER_S])
         yield from lidar.imu_packets(at_ns, up, np.zeros((1, 3)))
 
 
@@ -137,8 +136,8 @@ def write_capture(path: Path, recording: BenchRecording, seconds: float) -> None
     for sensor in recording.sensors:
         lidar = _lidar(sensor)
         sources = [(_lidar_packets(lidar), sensor.port, 0)]
-        if recording.imu and (rate_hz := KINDS[sensor.kind].imu_per_s):
-            packets = _imu_packets(lidar, EPOCH_NS + sensor.phase_ns, rate_hz)
+        if recording.imu and sensor.kind in OUSTER:
+            packets = _imu_packets(lidar, EPOCH_NS + sensor.phase_ns)
             # The IMU of an Ouster sends to the next port.
             sources.append((packets, sensor.port + 1, _IMU_FIRST_IDENT))
         for packets, port, first_ident in sources:
@@ -181,7 +180,7 @@ def _cloud(by_ring: bool, frame: str) -> bytes:
     ]
     flat = [(plane.T if by_ring else plane).ravel().tolist() for plane in planes]
     form = Form(frame=frame, height=CLOUD_RINGS if by_ring else 1, gap=10)
-    return cloud_message(OUSTER, list(zip(*flat, strict=True)), 0, form)
+    return cloud_message(OUSTER_POINTS, list(zip(*flat, strict=True)), 0, form)
 
 
 # -- recordings -----------------------------------------------------------------------------------
@@ -191,24 +190,20 @@ def make(recording: BenchRecording, seconds: float, folder: Path) -> None:
     """Write recording, rig and the files that its sensors need into an existing folder."""
     for sensor in recording.sensors:
         if sensor.file:
-            (folder / sensor.file).write_bytes(_calibration(sensor))
+            (folder / sensor.file).write_bytes(_metadata(sensor))
     (folder / RIG).write_text(_rig(recording.sensors), encoding="utf-8")
     # Renamed when complete: a recording that exists is complete.
     partial_path = folder / f"{recording.file}.partial"
-    if recording.is_bag:
+    if recording.sensors[0].topic:
         write_clouds(partial_path, recording.sensors, seconds)
     else:
         write_capture(partial_path, recording, seconds)
     partial_path.replace(folder / recording.file)
-    (folder / DIGEST).write_text(digest(), encoding="utf-8")
 
 
-def _calibration(sensor: BenchSensor) -> bytes:
-    """Metadata or angles of a lidar, with the ports of the recording."""
-    content = _lidar(sensor).files.content
-    if sensor.kind not in (LOW, FULL):
-        return content
-    document = json.loads(content)
+def _metadata(sensor: BenchSensor) -> bytes:
+    """Metadata of an Ouster, with the ports of the recording."""
+    document = json.loads(_lidar(sensor).files.content)
     ports = {"udp_port_lidar": sensor.port, "udp_port_imu": sensor.port + 1}
     document["config_params"].update(ports)
     return json.dumps(document, indent=1).encode()
