@@ -384,15 +384,16 @@ class PoseComparison:
         """
         if self.places < _LEAST_PLACES:
             return False
-        moves = [
-            other @ np.linalg.inv(pose) for pose, other in zip(self._poses, poses, strict=True)
-        ]
-        comparison = PoseComparison(self._names, poses, tries_others=False)
+        # Of two lidars alone: others would cost more and say little.
+        names, chosen = [self._names[lidar] for lidar in key], [poses[lidar] for lidar in key]
+        moves = [poses[lidar] @ np.linalg.inv(self._poses[lidar]) for lidar in key]
+        comparison = PoseComparison(names, chosen, tries_others=False)
         for place in self._places[:_KEPT]:
-            comparison.add([_moved(cloud, moves[cloud.lidar]) for cloud in place])
+            both = [cloud for cloud in place if cloud.lidar in key]
+            comparison.add([_moved(cloud, key.index(cloud.lidar), moves) for cloud in both])
             if comparison._is_misfit:
                 return False
-        figures = comparison.figures()[list(self._pairs).index(key)]
+        (figures,) = comparison.figures()
         return (
             figures.outcome == MEASURED
             and figures.shift_mm is not None
@@ -414,13 +415,14 @@ class _Part:
     undetermined: tuple[str, ...] = field(default=())
 
 
-def _moved(cloud: Cloud, move: F64Array) -> Cloud:
-    """A cloud with another pose of its lidar; move: (4, 4)."""
+def _moved(cloud: Cloud, lidar: int, moves: Sequence[F64Array]) -> Cloud:
+    """A cloud with another number and pose of its lidar; moves: (4, 4), by the new number."""
+    move = moves[lidar]
     points_m = np.matmul(cloud.points_m, move[:3, :3].T) + move[:3, 3]
     origin_m = cloud.origin_m
     if origin_m is not None:
         origin_m = np.matmul(move[:3, :3], origin_m) + move[:3, 3]
-    return Cloud(cloud.lidar, points_m, cloud.time_s, origin_m)
+    return Cloud(lidar, points_m, cloud.time_s, origin_m)
 
 
 def _across(rows: Rows) -> int:
