@@ -18,7 +18,8 @@ from mlbatch.batching.sweeps import Sweep, SweepSet, sweeps_of
 from mlbatch.batching.windows import Window
 from mlbatch.comparison.places import apart, cells, difference, spot_apart_ms
 from mlbatch.decode.decoder import Decoder, ScanHeader
-from mlbatch.page.instant import InstantSet, SetPoints, SharedInstant, Spot
+from mlbatch.page.instant import InstantSet, SharedInstant, Spot
+from mlbatch.page.points import CloudPoints
 from mlbatch.pipeline.sensor import Sensor
 from mlbatch.types import WindowColumns
 from mlbatch.units import NS_PER_MS, NS_PER_S
@@ -147,7 +148,7 @@ class InstantFinder:
             self._names[-1]: sweeps_of(window.columns, len(self._sensors), window.end_ns)
         }
 
-    def _points(self, window: Window, members: Sequence[SweepSet]) -> list[SetPoints]:
+    def _points(self, window: Window, members: Sequence[SweepSet]) -> list[CloudPoints]:
         """The points of each set."""
         parts = [one.columns for one in self._windows]
         names = ("stamp_ns", "sensor", "ring_index", "encoder")
@@ -161,14 +162,14 @@ class InstantFinder:
         self._decoder = self._decoder or self._new_decoder()
         scan = self._decoder.scan(some, ScanHeader(0, 0, start_ns, end_ns, True, 0))
         time_ns = scan.time_ns.astype(np.int64) + (start_ns - window.end_ns)
-        points = SetPoints(scan.xyz, scan.lidar_id, time_ns, scan.ring, scan.intensity)
+        points = CloudPoints(scan.xyz, scan.lidar_id, time_ns, scan.ring, scan.intensity)
         return [points.take(one[rows][scan.column]) for one in inside]
 
     def _instant(
         self,
         window: Window,
         members: dict[str, SweepSet],
-        points: Sequence[SetPoints],
+        points: Sequence[CloudPoints],
         shown: int,
         spot: Spot | None,
     ) -> SharedInstant:

@@ -7,7 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from mlbatch.arrays import BoolArray, F32Array, F64Array, I64Array
-from mlbatch.page.instant import RADIUS_M, SetPoints, Spot
+from mlbatch.page.instant import RADIUS_M, Spot
+from mlbatch.page.points import CloudPoints
 from mlbatch.units import NS_PER_MS
 
 # Sides of the cells whose times are compared, and of those that find neighbours.
@@ -41,7 +42,7 @@ class Apart:
         return (float(np.median(shared)), float(shared.max())) if len(shared) else None
 
 
-def cells(points: SetPoints) -> I64Array:
+def cells(points: CloudPoints) -> I64Array:
     """Number of the cell of each point, -1 out of reach, (n,)."""
     away_m = np.hypot(points.xyz[:, 0], points.xyz[:, 1])
     x, y = np.floor((points.xyz[:, :2] + _FARTHEST_M) / _CELL_M).astype(np.int64).T
@@ -49,7 +50,7 @@ def cells(points: SetPoints) -> I64Array:
     return np.where(inside, x * round(2 * _FARTHEST_M / _CELL_M) + y, -1)
 
 
-def apart(points: SetPoints, cell: I64Array, period_ns: int) -> Apart:
+def apart(points: CloudPoints, cell: I64Array, period_ns: int) -> Apart:
     """Compare the mean times of the lidars in each cell, but for those with a seam."""
     rows = np.flatnonzero(cell >= 0)
     key = cell[rows] * 256 + points.lidar[rows]
@@ -73,7 +74,7 @@ def apart(points: SetPoints, cell: I64Array, period_ns: int) -> Apart:
     return Apart(number, apart_ns, lidars)
 
 
-def difference(fused: SetPoints, window: SetPoints, period_ns: int) -> Spot | None:
+def difference(fused: CloudPoints, window: CloudPoints, period_ns: int) -> Spot | None:
     """The largest difference; None where the times of lidars are as near in the fused set."""
     mine, theirs = cells(fused), cells(window)
     one, two = apart(fused, mine, period_ns), apart(window, theirs, period_ns)
@@ -104,7 +105,7 @@ def difference(fused: SetPoints, window: SetPoints, period_ns: int) -> Spot | No
     return Spot((x, y, z), float(gain_ns[best]), *counts)
 
 
-def spot_apart_ms(points: SetPoints, spot: Spot) -> float | None:
+def spot_apart_ms(points: CloudPoints, spot: Spot) -> float | None:
     """Time between the mean times of the lidars around a spot, ms; None for fewer than two."""
     x, y, _ = spot.centre_m
     near = points.take(np.hypot(points.xyz[:, 0] - x, points.xyz[:, 1] - y) < RADIUS_M)

@@ -118,12 +118,15 @@ def _message_files(
         yield path, McapFile(log, path, where)
 
 
-def _run_of_file(log: CheckLog, output: Path, path: Path, file: McapFile | BagFile) -> _Run:
-    """The constants of a run by its first file."""
+def _run_of_file(
+    log: CheckLog, output: Path, path: Path, file: McapFile | BagFile, report: Path | None = None
+) -> _Run:
+    """The constants of a run by its first file; report: as of `open_scans`."""
     from mlbatch.outputs.rosbag1 import BagFile
 
     if isinstance(file, BagFile):
-        return _run_of_bag(path)
+        files = RunFiles.of(path, report)
+        return _Run(str(path), RunMetadata(), files.report_text(), files.table_text())
     return _run_of_mcap(log, output, path, file)
 
 
@@ -146,11 +149,6 @@ def _run_of_mcap(log: CheckLog, output: Path, path: Path, file: McapFile) -> _Ru
     metadata = metadata_of_grid(log, path.name, grid)
     _refuse_damage(log, path)
     return _Run(str(path), metadata, report, table)
-
-
-def _run_of_bag(path: Path) -> _Run:
-    files = RunFiles.of(path)
-    return _Run(str(path), RunMetadata(), files.report_text(), files.table_text())
 
 
 def _scans_of_messages(
@@ -229,7 +227,11 @@ def _scans_of_files(
 
 
 def _run_of_files(
-    folder: Path, form: FileFormat, files: list[ScanFile], log: CheckLog
+    folder: Path,
+    form: FileFormat,
+    files: list[ScanFile],
+    log: CheckLog,
+    report: Path | None = None,
 ) -> tuple[_Run, ScanReader, str]:
     """The constants of a run, the reader of its files, and the frame of its points."""
     _refuse_damage(log, folder)
@@ -241,7 +243,7 @@ def _run_of_files(
             f"{files[0].path}: {err}; see `mlbatch verify`, and convert again"
         ) from err
     _refuse_damage(log, folder)
-    texts = RunFiles.of(folder)
+    texts = RunFiles.of(folder, report)
     run = _Run(str(folder), metadata, texts.report_text(), texts.table_text())
     reader.know(run.metadata)
     return run, reader, metadata.frame_id or ""
@@ -282,7 +284,7 @@ class IndexedScans:
 class _IndexedMessages(IndexedScans):
     """An MCAP file, or a bag."""
 
-    def __init__(self, path: Path, kind: str) -> None:
+    def __init__(self, path: Path, kind: str, report: Path | None) -> None:
         from mlbatch.outputs.mcap_file import McapFile
 
         log = CheckLog()
@@ -291,7 +293,7 @@ class _IndexedMessages(IndexedScans):
         self._messages: list[tuple[int, MessagePlace]] = []
         for file, source in _message_files(log, path, kind):
             if not self._files:
-                super().__init__(path, _run_of_file(log, path, file, source))
+                super().__init__(path, _run_of_file(log, path, file, source, report))
                 self._scans = MessageScans(path, self._run)
             if isinstance(source, McapFile):
                 # They have all rows of scans.csv.
@@ -336,10 +338,10 @@ class _IndexedMessages(IndexedScans):
 class _IndexedFiles(IndexedScans):
     """A folder with a file for each scan."""
 
-    def __init__(self, path: Path, form: FileFormat) -> None:
+    def __init__(self, path: Path, form: FileFormat, report: Path | None) -> None:
         log = CheckLog()
         self._files = scan_files(log, path, form.suffix)
-        run, self._reader, self._frame_id = _run_of_files(path, form, self._files, log)
+        run, self._reader, self._frame_id = _run_of_files(path, form, self._files, log, report)
         super().__init__(path, run)
         for file in self._files:
             sensor = file.sensor_index(log, run.sensors)
@@ -354,18 +356,19 @@ class _IndexedFiles(IndexedScans):
         return self._run.scan(stored[0], self._frame_id)
 
 
-def open_scans(path: Path) -> IndexedScans:
+def open_scans(path: Path, report: Path | None = None) -> IndexedScans:
     """The scans of an output of `convert`, each of which can be read alone.
 
-    Only the indexes of the output are read. RecordingError for what is none, or unfinished.
+    Only the indexes of the output are read; report: its path, None for the usual one.
+    RecordingError for what is none, or unfinished.
     """
     _refuse_partial(path)
     kind = kind_of(path)
     if kind.form is not None:
-        return _IndexedFiles(path, kind.form)
+        return _IndexedFiles(path, kind.form, report)
     if not kind.name:
         raise _no_output(path, "one file of a folder" if format_of([path]) else kind.found)
-    return _IndexedMessages(path, kind.name)
+    return _IndexedMessages(path, kind.name, report)
 
 
 # -- scans ----------------------------------------------------------------------------------------

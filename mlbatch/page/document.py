@@ -17,7 +17,7 @@ import numpy.typing as npt
 
 from mlbatch.arrays import F64Array, I64Array
 from mlbatch.clocks.timescale import DESCRIPTION, describe_time
-from mlbatch.outputs.damage import VerifyError
+from mlbatch.errors import RecordingError
 from mlbatch.page.clouds import chosen_clouds
 from mlbatch.page.findings import Finding, Level, findings, number, percent, verdict
 from mlbatch.page.points import PageCloud
@@ -52,6 +52,8 @@ _FLAT_POINTS = 0.02  # of the largest
 _PLAY_MS = (100, 500)
 # Colours of points: key of the plots, name.
 COLOURS = {"lidar": "lidar", "height": "height", "time": "time", "bright": "intensity"}
+# Arrays that colours need.
+_NEEDED = {"lidar": "lidar_id", "time": "time_ns", "intensity": "intensity"}
 _NO_SCANS = "The scans are not available to this page: give the output itself."
 
 
@@ -61,11 +63,6 @@ def page_text(source: Source) -> str:
     windows = None if source.table is None else read_windows(source.table, report.slices)
     clouds, why_no_clouds = _clouds(source, windows)
     found = findings(report, windows)
-    lacking = {
-        "lidar": not all(cloud.has_lidar for cloud in clouds),
-        "time": not all(cloud.has_time for cloud in clouds),
-        "intensity": not all(cloud.has_intensity for cloud in clouds),
-    }
     return render(
         "run.html",
         version=report.version,
@@ -81,7 +78,7 @@ def page_text(source: Source) -> str:
         about_clouds=_about_clouds(clouds, windows),
         why_no_clouds=why_no_clouds,
         colours=COLOURS,
-        lacking=[name for name, is_absent in lacking.items() if is_absent],
+        lacking=lacking(frozenset().union(*(cloud.absent for cloud in clouds))),
         accounts=_accounts(report),
         clocks=[_clock(sensor, report.recorded_s) for sensor in report.sensors],
         sensors=list(map(_sensor, report.sensors)),
@@ -106,8 +103,8 @@ def _clouds(source: Source, windows: Windows | None) -> tuple[list[PageCloud], s
     if source.output is None:
         return [], _NO_SCANS
     try:
-        clouds = chosen_clouds(source.output, windows, source.scans)
-    except VerifyError as err:
+        clouds = chosen_clouds(source.output, windows, source.scans, source.report_path)
+    except RecordingError as err:
         return [], f"The scans could not be read: {err}"
     return clouds, _NO_SCANS
 
@@ -250,6 +247,11 @@ def _about_clouds(clouds: list[PageCloud], windows: Windows | None) -> str:
         f"{len(clouds):,} of {number(len(windows), 'scan')}, with {kept_words(clouds[0])}; "
         f"{kilobytes:,.0f} kB per scan; coordinates rounded to {step_mm:.0f} mm."
     )
+
+
+def lacking(absent: frozenset[str]) -> list[str]:
+    """Colours that scans do not have; absent: as of `Scan`."""
+    return [name for name, array in _NEEDED.items() if array in absent]
 
 
 def kept_words(cloud: PageCloud) -> str:
@@ -424,7 +426,10 @@ def cloud_data(cloud: PageCloud, after_s: float) -> dict[str, Any]:
         "centre": cloud.centre_m,
         "view": cloud.view_m,
         "times": cloud.times_ms,
-        "has": {"lidar": cloud.has_lidar, "time": cloud.has_time, "ring": cloud.has_ring},
+        "has": {
+            **{name: _NEEDED[name] not in cloud.absent for name in ("lidar", "time")},
+            "ring": "ring" not in cloud.absent,
+        },
     }
 
 

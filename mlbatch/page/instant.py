@@ -6,15 +6,13 @@ import base64
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 import numpy as np
 
-from mlbatch.arrays import BoolArray, F32Array, F64Array, I64Array, U8Array, U16Array
-from mlbatch.outputs.stored_scan import StoredScan
+from mlbatch.arrays import F64Array, I64Array
 from mlbatch.page.clouds import MOST_CHARS
 from mlbatch.page.document import cloud_data
-from mlbatch.page.points import PageCloud, Place, joined_cloud
+from mlbatch.page.points import CloudPoints, PageCloud, Place, joined_cloud
 from mlbatch.page.policies import offset_m
 from mlbatch.units import NS_PER_MS
 
@@ -24,21 +22,6 @@ _NEAREST_M = 2.0
 # Of the circle around a spot, and from the camera to it, m.
 RADIUS_M = 2.5
 _CAMERA_M = 12.5
-
-
-class SetPoints(NamedTuple):
-    """Points of a set, (n, 3) m, body frame, and (n,); time_ns: after the instant."""
-
-    xyz: F32Array
-    lidar: U8Array
-    time_ns: I64Array
-    ring: U16Array
-    intensity: F32Array
-
-    def take(self, rows: BoolArray | I64Array) -> SetPoints:
-        """Some of the points."""
-        xyz, lidar, time_ns, ring, intensity = self
-        return SetPoints(xyz[rows], lidar[rows], time_ns[rows], ring[rows], intensity[rows])
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,7 +55,7 @@ class InstantSet:
 
     name: str
     ages_ms: tuple[tuple[float, float] | None, ...]
-    points: SetPoints | None = None
+    points: CloudPoints | None = None
     spot_ms: float | None = None
     apart_ms: tuple[float, float] | None = None
 
@@ -147,15 +130,13 @@ class SharedInstant:
                 return clouds
             stride = math.ceil(stride * share)
 
-    def _cloud(self, name: str, points: SetPoints, stride: int) -> PageCloud:
-        xyz, lidar, time_ns, ring, intensity = points
-        scan = StoredScan(
-            *("", 0, xyz, False), lidar_id=lidar, time_ns=time_ns, ring=ring, intensity=intensity
-        )
+    def _cloud(self, name: str, points: CloudPoints, stride: int) -> PageCloud:
         first_ns, last_ns = (round(-age * NS_PER_MS) for age in self.range_ms)
         place = Place(name, 0, 0, 0, 0)
         times_ns = first_ns, last_ns
-        return joined_cloud(place, [scan], self.period_ns, self.columns, stride, times_ns=times_ns)
+        return joined_cloud(
+            place, [points], self.period_ns, self.columns, stride, times_ns=times_ns
+        )
 
     def toggle(self, clouds: Sequence[PageCloud]) -> dict[str, object]:
         """The data of the player."""

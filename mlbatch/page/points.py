@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import zlib
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import numpy as np
 from isal import isal_zlib
 
 from mlbatch.arrays import BoolArray, F32Array, F64Array, I64Array, U8Array, U16Array
-from mlbatch.outputs.stored_scan import StoredScan
-from mlbatch.page.windows import Windows
+from mlbatch.outputs.scan import Scan
 from mlbatch.units import NS_PER_MS
 
 # Finest step of coordinates, below the noise of lidars.
@@ -54,10 +55,7 @@ class PageCloud:
     height_m: tuple[float, float]  # range of the colours
     centre_m: tuple[float, float, float]  # of the first view
     view_m: float  # radius around the centre that contains most points of every lidar
-    has_lidar: bool
-    has_time: bool
-    has_intensity: bool
-    has_ring: bool
+    absent: frozenset[str]  # as of `Scan`
 
     @property
     def chars(self) -> int:
@@ -65,68 +63,64 @@ class PageCloud:
         return -(-len(self.packed) // 3) * 4
 
 
-@dataclass(frozen=True, slots=True)
-class _Points:
-    """Valid points of one stored scan, (p, 3) and (p,); None for what it does not have."""
+class CloudPoints(NamedTuple):
+    """Points of a scan or set, (p, 3) m, body frame, and (p,); time_ns: after its start."""
 
     xyz: F32Array
-    lidar: U8Array | None
-    time_ns: I64Array | None
-    ring: I64Array | None
-    intensity: F64Array | None
+    lidar: U8Array
+    time_ns: I64Array
+    ring: U16Array
+    intensity: F32Array
 
+    @classmethod
+    def of(cls, scan: Scan) -> CloudPoints:
+        """The points of a scan, without empty slots; zeros for what its output does not store."""
+        valid = scan.is_valid
+        count = int(np.count_nonzero(valid))
+        # Of dense scans all are.
+        rows = slice(None) if valid.ndim == 1 and count == len(valid) else valid
 
-def page_cloud(
-    place: Place, scans: list[StoredScan], windows: Windows, stride: int = 1
-) -> PageCloud:
-    """Join the scans of a window of a table; stride: keep every nth column of each lidar."""
-    window_ns = int(windows.end_ns[place.row] - windows.start_ns[place.row])
-    return joined_cloud(place, scans, window_ns, windows.expected[place.row], stride)
+        def of(name: str) -> Any:
+            return np.zeros(count, np.uint8) if name in scan.absent else getattr(scan, name)[rows]
+
+        return cls(scan.xyz[rows], of("lidar_id"), of("time_ns"), of("ring"), of("intensity"))
+
+    def take(self, rows: BoolArray | I64Array) -> CloudPoints:
+        """Some of the points."""
+        xyz, lidar, time_ns, ring, intensity = self
+        return CloudPoints(xyz[rows], lidar[rows], time_ns[rows], ring[rows], intensity[rows])
 
 
 def joined_cloud(
     place: Place,
-    scans: list[StoredScan],
+    parts: Sequence[CloudPoints],
     window_ns: int,
     expected: I64Array,
     stride: int = 1,
+    absent: frozenset[str] = frozenset(),
     is_fast: bool = False,
     times_ns: tuple[int, int] | None = None,
 ) -> PageCloud:
     """Join the scans of a window.
 
-    expected: columns of a whole window by lidar; stride: keep every nth column of each; is_fast: a
-    seventh of the time to deflate, for a few percent more bytes; times_ns: range of times to store,
-    where it is not that of the points.
+    expected: columns of a whole window by lidar; stride: keep every nth column of each; absent: as
+    of `Scan`; is_fast: a seventh of the time to deflate, for a few percent more bytes; times_ns:
+    range of times to store, where it is not that of the points.
     """
-    parts = [_valid(scan) for scan in scans]
-    total = sum(len(part.xyz) for part in parts)
-    lidars = [part.lidar for part in parts if part.lidar is not None]
-    times = [part.time_ns for part in parts if part.time_ns is not None]
-    rings = [part.ring for part in parts if part.ring is not None]
-    bright = [part.intensity for part in parts if part.intensity is not None]
-    # Some outputs have no times.
+    points, lidar, times, ring, intensity = map(np.concatenate, zip(*parts, strict=True))
+    time_ns: I64Array = times.astype(np.int64)
     first_ns, last_ns = times_ns or (0, window_ns)
-    first_ns = min([first_ns, *(int(one.min(initial=first_ns)) for one in times)])
-    last_ns = max([last_ns, *(int(one.max(initial=last_ns)) for one in times)])
-    has_lidar = len(lidars) == len(parts)
-    has_time = len(times) == len(parts)
-    has_ring = len(rings) == len(parts)
-    has_intensity = len(bright) == len(parts)
-    none = np.zeros(total, np.int64)
-    lidar: U8Array = np.concatenate(lidars) if has_lidar else none.astype(np.uint8)
-    time_ns: I64Array = np.concatenate(times) if has_time else none
-    ring: I64Array = np.concatenate(rings) if has_ring else none
-    intensity: F64Array = np.concatenate(bright) if has_intensity else none.astype(np.float64)
+    first_ns = min(first_ns, int(time_ns.min(initial=first_ns)))
+    last_ns = max(last_ns, int(time_ns.max(initial=last_ns)))
     # By lidar and ring; those of one are in the order of their columns already.
-    order = np.argsort(ring.astype(np.uint16), kind="stable")
+    order = np.argsort(ring, kind="stable")
     order = order[np.argsort(lidar[order], kind="stable")]
     if stride > 1:
         # Points without times are in the order of their columns.
-        share = time_ns / window_ns if has_time else np.arange(total) / max(1, total)
+        has_times, total = "time_ns" not in absent, len(points)
+        share = time_ns / window_ns if has_times else np.arange(total) / max(1, total)
         order = order[_columns(share, lidar, expected)[order] % stride == 0]
     # By axis: numpy is slow in loops over three values.
-    points = np.concatenate([part.xyz for part in parts])
     xyz: F64Array = points[order].T.astype(np.float64, order="C")
     low_m: F64Array = xyz.min(axis=1) if len(order) else np.zeros(3)
     high_m: F64Array = xyz.max(axis=1) if len(order) else np.zeros(3)
@@ -134,7 +128,7 @@ def joined_cloud(
     centre_m, view_m = _view(xyz, lidar[order])
     return PageCloud(
         place=place,
-        total=total,
+        total=len(points),
         stride=stride,
         shown=len(order),
         packed=_packed(
@@ -151,34 +145,7 @@ def joined_cloud(
         height_m=_span(xyz[2]),
         centre_m=(float(centre_m[0]), float(centre_m[1]), float(centre_m[2])),
         view_m=view_m,
-        has_lidar=has_lidar,
-        has_time=has_time,
-        has_intensity=has_intensity,
-        has_ring=has_ring,
-    )
-
-
-def _valid(scan: StoredScan) -> _Points:
-    # Faster than `all` over three values.
-    x, y, z = (np.isfinite(scan.xyz[..., axis]) for axis in range(3))
-    valid: BoolArray = x & y & z
-    count = int(np.count_nonzero(valid))
-    # Of dense scans all are.
-    rows = slice(None) if valid.ndim == 1 and count == len(valid) else valid
-    lidar: U8Array | None = None
-    if scan.sensor is not None:
-        lidar = np.full(count, scan.sensor, dtype=np.uint8)
-    elif scan.lidar_id is not None:
-        # In an organized scan, of the columns.
-        ids = scan.lidar_id if scan.lidar_id.ndim == valid.ndim else scan.lidar_id[:, None]
-        lidar = np.broadcast_to(ids, valid.shape)[rows]
-    bright = scan.intensity if scan.intensity is not None else scan.byte_intensity
-    return _Points(
-        scan.xyz[rows],
-        lidar,
-        None if scan.time_ns is None else scan.time_ns[rows],
-        None if scan.ring is None else scan.ring[rows].astype(np.int64),
-        None if bright is None else bright[rows].astype(np.float64),
+        absent=absent,
     )
 
 
@@ -237,7 +204,7 @@ def _view(xyz: F64Array, lidar: U8Array) -> tuple[F64Array, float]:
     return centre_m, max(1.0, *(_quantile(away, _IN_VIEW) for away in away_m))
 
 
-def _quantile(values: F64Array, share: float) -> float:
+def _quantile(values: F64Array | F32Array, share: float) -> float:
     """A value of the array by nearest rank; 0 without one."""
     if not len(values):
         return 0.0
@@ -245,12 +212,13 @@ def _quantile(values: F64Array, share: float) -> float:
     return float(np.partition(values, rank)[rank])
 
 
-def _span(values: F64Array) -> tuple[float, float]:
+def _span(values: F64Array | F32Array) -> tuple[float, float]:
     return _quantile(values, _LOW), _quantile(values, _HIGH)
 
 
-def _bytes_of(values: F64Array) -> U8Array:
+def _bytes_of(values: F32Array) -> U8Array:
     """Values in 256 steps between the ends of their range of colours."""
     low, high = _span(values)
     width = high - low if high > low else 1.0
-    return np.rint(np.clip((values - low) / width, 0.0, 1.0) * _BYTE).astype(np.uint8)
+    found: U8Array = np.rint(np.clip((values - low) / width, 0.0, 1.0) * _BYTE).astype(np.uint8)
+    return found

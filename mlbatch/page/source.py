@@ -24,6 +24,7 @@ class Source:
     output: Path | None  # None: no scans
     page: Path  # usual place of the page
     scans: int | None = None  # number to show, 0: all; None: as many as the page has room for
+    report_path: Path | None = None  # if it is not the usual one
 
 
 def shown_scans(text: str | None, option: str = "--html-scans") -> int | None:
@@ -105,7 +106,7 @@ def _of_output(path: Path, report: Path | None) -> Source:
             f"{path}: expected a report in or next to the output, found none; give it with "
             "--report, or convert the recording"
         )
-    return Source(report_of(files.report, text), table, path, page_of(path))
+    return Source(report_of(files.report, text), table, path, page_of(path), report_path=report)
 
 
 def _container(path: Path) -> str:

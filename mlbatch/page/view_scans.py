@@ -11,9 +11,8 @@ import numpy as np
 
 from mlbatch.errors import MlbatchError, RecordingError, system_error
 from mlbatch.outputs.scan import Scan
-from mlbatch.outputs.stored_scan import StoredScan
 from mlbatch.page.document import cloud_data
-from mlbatch.page.points import Place, joined_cloud
+from mlbatch.page.points import CloudPoints, Place, joined_cloud
 from mlbatch.units import NS_PER_S
 
 # Scans to go back to without a new start.
@@ -128,26 +127,11 @@ def _window_of(scan: Scan) -> tuple[int, int, int]:
 def _packed(parts: list[Scan], number: int, first_ns: int) -> bytes:
     first = parts[0]
     place = Place("", number, first.index, first.slice, first.start_ns)
-    stored = [_stored(scan) for scan in parts]
     window_ns = first.end_ns - first.start_ns
     # All columns are shown, whatever their number.
-    cloud = joined_cloud(place, stored, window_ns, np.ones(1, np.int64), is_fast=True)
+    one, points = np.ones(1, np.int64), list(map(CloudPoints.of, parts))
+    cloud = joined_cloud(place, points, window_ns, one, absent=first.absent, is_fast=True)
     return _answer(cloud_data(cloud, (first.start_ns - first_ns) / NS_PER_S), cloud.packed)
-
-
-def _stored(scan: Scan) -> StoredScan:
-    """A scan as outputs have it, without the arrays that are absent."""
-    has = {name: name not in scan.absent for name in ("intensity", "time_ns", "ring", "lidar_id")}
-    return StoredScan(
-        where="",
-        start_ns=scan.start_ns,
-        xyz=scan.xyz,
-        organized=scan.xyz.ndim == 3,
-        intensity=scan.intensity if has["intensity"] else None,
-        time_ns=scan.time_ns.astype(np.int64) if has["time_ns"] else None,
-        ring=scan.ring if has["ring"] else None,
-        lidar_id=scan.lidar_id if has["lidar_id"] else None,
-    )
 
 
 def _answer(header: dict[str, object], points: bytes = b"") -> bytes:

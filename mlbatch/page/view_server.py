@@ -11,7 +11,7 @@ import numpy as np
 
 from mlbatch.errors import UsageError
 from mlbatch.outputs.scan import Scan
-from mlbatch.page.document import COLOURS
+from mlbatch.page.document import COLOURS, lacking
 from mlbatch.page.templates import asset, page_json, render
 from mlbatch.page.view_scans import ViewScans
 from mlbatch.units import parse_rate
@@ -96,7 +96,6 @@ class _Handler(BaseHTTPRequestHandler):
 
 
 def _page(title: str, first: Scan, total: int | None, expected: int | None) -> bytes:
-    names = {"lidar": "lidar_id", "time": "time_ns", "intensity": "intensity"}
     poses = [sensor.body_from_sensor for sensor in first.info.sensors]
     data = {
         "sensors": first.sensors,
@@ -117,7 +116,7 @@ def _page(title: str, first: Scan, total: int | None, expected: int | None) -> b
         about=f"{', '.join(first.sensors)} at {first.rate_hz} Hz, all points; coordinates rounded "
         "to 5 mm, or 1/65535 of the size of the scan if that is more.",
         colours=COLOURS,
-        lacking=[name for name, array in names.items() if array in first.absent],
+        lacking=lacking(first.absent),
         data=page_json(data),
         script="".join(map(asset, ("viewer.js", "player.js", "view.js"))),
     )

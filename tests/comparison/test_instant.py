@@ -16,7 +16,8 @@ from mlbatch.arrays import F32Array, F64Array, U8Array
 from mlbatch.comparison.compare import WINDOWS, Comparison, compare
 from mlbatch.comparison.places import apart, cells, difference
 from mlbatch.discovery.discover import SensorSelection
-from mlbatch.page.instant import InstantSet, SetPoints, SharedInstant
+from mlbatch.page.instant import InstantSet, SharedInstant
+from mlbatch.page.points import CloudPoints
 from mlbatch.pipeline.job import Job
 from tests.builders.simulated import Recorded, record, scenario_text
 
@@ -160,12 +161,12 @@ def _arrays(one: InstantSet) -> tuple[F32Array, U8Array, F64Array]:
 # -- places, by hand --------------------------------------------------------------------------
 
 
-def _wall(x_m: float, time_ms: float, lidar: int, *, shift_m: float = 0.0) -> SetPoints:
+def _wall(x_m: float, time_ms: float, lidar: int, *, shift_m: float = 0.0) -> CloudPoints:
     """A wall of 1.6 m by 2 m at x, y 10.2 m, points 0.1 m and 0.08 m apart."""
     along, up = np.meshgrid(np.arange(0.2, 1.8, 0.1), np.arange(0, 2, 0.08))
     xyz = np.stack([x_m + along.ravel(), np.full(along.size, 10.2 + shift_m), up.ravel()], 1)
     count = len(xyz)
-    return SetPoints(
+    return CloudPoints(
         xyz.astype(np.float32),
         np.full(count, lidar, np.uint8),
         np.full(count, round(time_ms * 1e6), np.int64),
@@ -174,8 +175,8 @@ def _wall(x_m: float, time_ms: float, lidar: int, *, shift_m: float = 0.0) -> Se
     )
 
 
-def _all(*parts: SetPoints) -> SetPoints:
-    return SetPoints(*map(np.concatenate, zip(*parts, strict=True)))
+def _all(*parts: CloudPoints) -> CloudPoints:
+    return CloudPoints(*map(np.concatenate, zip(*parts, strict=True)))
 
 
 PERIOD_NS = 100_000_000

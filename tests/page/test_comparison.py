@@ -16,7 +16,8 @@ from hypothesis import strategies as st
 
 from mlbatch.page import write_text_page
 from mlbatch.page.comparison import binned, comparison_page, nice_step
-from mlbatch.page.instant import InstantSet, SetPoints, SharedInstant, Spot
+from mlbatch.page.instant import InstantSet, SharedInstant, Spot
+from mlbatch.page.points import CloudPoints
 from mlbatch.page.policies import PolicyFigures, offset_m
 from tests.page.browser import CHROMIUM, NO_CHROMIUM, Browser, browser
 from tests.page.test_view import wait_for
@@ -63,7 +64,7 @@ def _set(name: str, oldest_ms: float, *, has_cloud: bool = True) -> InstantSet:
     time_ns = np.linspace(-1e8, 0, len(turn)).astype(np.int64)
     time_ns[lidar == 1] -= round((oldest_ms - 100) * 1e6)
     intensity = np.zeros(len(turn), np.float32)
-    points = SetPoints(xyz, lidar, time_ns, lidar.astype(np.uint16), intensity)
+    points = CloudPoints(xyz, lidar, time_ns, lidar.astype(np.uint16), intensity)
     ages_ms = ((100.0, 0.0), (oldest_ms, oldest_ms - 100), None)
     if not has_cloud:
         return InstantSet(name, ages_ms)

@@ -14,6 +14,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
+from mlbatch.outputs.read import open_scans
 from mlbatch.page.clouds import choose_places, chosen_clouds, read_clouds
 from mlbatch.page.points import _view
 from mlbatch.page.windows import read_windows
@@ -180,7 +181,7 @@ def test_a_page_is_full_but_not_beyond(shell: Shell, monkeypatch: pytest.MonkeyP
     table = Path("scans/scans.csv").read_text(encoding="utf-8")
     windows = read_windows(table, 1)
     assert windows is not None
-    (one, *_) = read_clouds(Path("scans"), choose_places(windows, 1), windows)
+    (one, *_) = read_clouds(open_scans(Path("scans")), choose_places(windows, 1), windows)
     for room in (3, 4, 5):
         limit = int((room + 0.9) * one.chars)
         monkeypatch.setattr("mlbatch.page.clouds.MOST_CHARS", limit)
@@ -199,7 +200,7 @@ def test_empty_scans_promise_no_room(shell: Shell, monkeypatch: pytest.MonkeyPat
         Path(f"none/{index:06}.npz").replace(f"scans/{index:06}.npz")
     windows = read_windows(Path("scans/scans.csv").read_text(encoding="utf-8"), 1)
     assert windows is not None
-    (one,) = read_clouds(Path("scans"), choose_places(windows, 7)[1:2], windows)
+    (one,) = read_clouds(open_scans(Path("scans")), choose_places(windows, 7)[1:2], windows)
     assert one.total == POINTS
     monkeypatch.setattr("mlbatch.page.clouds.MOST_CHARS", 3 * one.chars)
     clouds = chosen_clouds(Path("scans"), windows, None)
