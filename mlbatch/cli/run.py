@@ -225,7 +225,13 @@ def _write_page(conversion: Conversion, inputs: RunReport, target: Target) -> No
 
     report = report_of(target.html, report_text(inputs))
     table = None if conversion.table is None else conversion.table.text()
-    write_page(target.html, Source(report, table, target.written, target.html, target.html_scans))
+    write_page(
+        target.html,
+        Source(
+            *(report, table, target.written, target.html, target.html_scans),
+            report_path=target.request.report,
+        ),
+    )
 
 
 def _print_sensors(conversion: Conversion) -> None:

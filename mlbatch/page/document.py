@@ -68,7 +68,7 @@ def page_text(source: Source) -> str:
         version=report.version,
         title=_title(source),
         script="".join(map(asset, ("viewer.js", "player.js", "page.js"))),
-        data=page_json(_plot_data(report, windows, clouds)),
+        data=page_json(_plot_data(report, windows, clouds, shows_worst=_is_bad(found))),
         report=report,
         verdict=_verdict(report, found, windows),
         cards=_cards(report),
@@ -283,7 +283,12 @@ def _accounts(report: RunReport) -> dict[str, dict[str, list[dict[str, object]]]
         )
         accounts = {
             "Packets": {"accepted": packets.accepted, **packets.rejected, "lost": packets.lost},
-            "Columns": {"written": columns.written, **columns.dropped},
+            "Columns": {
+                "written": columns.written,
+                **columns.dropped,
+                # Of the lost packets, as many in each as in the others.
+                "lost": round(packets.lost * columns.decoded / max(1, packets.accepted)),
+            },
             "Points": {name: getattr(points, name) for name in _OUTCOMES},
         }
         for title, counts in accounts.items():
@@ -382,9 +387,14 @@ def _pose_words(sensor: SensorReport) -> tuple[str, str]:
 # -- data of the plots ------------------------------------------------------------------------
 
 
+def _is_bad(found: list[Finding]) -> bool:
+    return any(one.level >= Level.WARNING for one in found)
+
+
 def _plot_data(
-    report: RunReport, windows: Windows | None, clouds: list[PageCloud]
+    report: RunReport, windows: Windows | None, clouds: list[PageCloud], *, shows_worst: bool
 ) -> dict[str, Any]:
+    """shows_worst: first, instead of the first scan of the run."""
     sensors = report.sensors
     data: dict[str, Any] = {
         "sensors": [sensor.name for sensor in sensors],
@@ -401,13 +411,16 @@ def _plot_data(
     data["clouds"] = [
         cloud_data(one, windows.seconds(one.place.row))
         | {"data": base64.b64encode(one.packed).decode()}
+        | {"middle": int(windows.step[one.place.row] - windows.step[0]) + 0.5}
         for one in clouds
     ]
     between_ms = np.diff([one.place.start_ns for one in clouds]) / NS_PER_MS
     apart_ms = float(np.median(between_ms)) if len(between_ms) else 0.0
-    # The head of a run, before its first whole window, is chosen by hand.
     data["ahead"] = 1
-    data["begin"] = next((i for i, one in enumerate(clouds) if "first" in one.place.title), 0)
+    numbers = {word: i for i, one in enumerate(clouds) for word in one.place.title.split(" and ")}
+    # The head of a run, before its first whole window, is chosen by hand.
+    begin = numbers.get("first", 0)
+    data["begin"] = numbers.get("worst", begin) if shows_worst else begin
     data["play_ms"] = min(max(_PLAY_MS[0], apart_ms), _PLAY_MS[1])
     return data
 

@@ -11,6 +11,7 @@ import numpy as np
 from mlbatch.arrays import BoolArray
 from mlbatch.page.windows import Windows
 from mlbatch.page.words import MEANINGS
+from mlbatch.reports.ledger import SensorLedger
 from mlbatch.reports.report import RunReport
 
 _NETWORK = (
@@ -96,15 +97,18 @@ class Finding:
 
 def findings(report: RunReport, windows: Windows | None) -> list[Finding]:
     """All findings, the most serious first."""
+    stalls = [] if windows is None else _stalls(report, windows)
+    # Their loss is that of their stalls.
+    stalled = {one.sensor for one in stalls if one.has_all_loss}
     found = [
-        *_scans(report, windows),
-        *(() if windows is None else _stalls(windows)),
-        *_packets(report),
+        *_scans(report, windows, stalls),
+        *(finding for one in stalls for finding in one.findings()),
+        *_packets(report, stalled),
         *_columns(report),
         *_clocks(report),
         *_poses(report),
         *_faults(report),
-        *_warnings(report),
+        *_warnings(report, stalled),
     ]
     return sorted(found, key=lambda one: -one.level)
 
@@ -136,7 +140,7 @@ def number(count: int, one: str, many: str = "") -> str:
     return f"{count:,} {one if count == 1 else many or one + 's'}"
 
 
-def _scans(report: RunReport, windows: Windows | None) -> Iterator[Finding]:
+def _scans(report: RunReport, windows: Windows | None, stalls: list[_Stalls]) -> Iterator[Finding]:
     scans = report.scans
     written = scans.written
     if not written:
@@ -162,6 +166,9 @@ def _scans(report: RunReport, windows: Windows | None) -> Iterator[Finding]:
                 "No window is whole: head and tail, which are partial, are all that was written.",
                 "record longer, or use shorter windows (--rate)",
             )
+    if windows is not None and stalls:
+        near: BoolArray = np.logical_or.reduce([one.near for one in stalls])
+        incomplete -= int(np.count_nonzero(near & ~_is_partial(windows) & ~windows.complete))
     if incomplete > 0:
         yield Finding(
             Level.WARNING,
@@ -175,19 +182,28 @@ def _scans(report: RunReport, windows: Windows | None) -> Iterator[Finding]:
         )
 
 
-def _stalls(windows: Windows) -> Iterator[Finding]:
-    """Intervals of whole windows in which a sensor sent nothing."""
-    for i, name in enumerate(windows.sensors):
-        silent: BoolArray = windows.columns[:, i] == 0
-        if windows.has_head and len(silent) > 1:
-            # Head and tail are partial: alone, they are no stall.
-            silent[0] &= silent[1]
-            silent[-1] &= silent[-2] | windows.complete[-1]
-        intervals = _intervals(silent)
-        for first, end in intervals[:_MOST_STALLS]:
+@dataclass(frozen=True, slots=True)
+class _Stalls:
+    """Intervals of rows in which a sensor sent nothing; near: rows of these and of neighbours.
+
+    lost: packets of the sensor; has_all_loss: they are of the stalls.
+    """
+
+    sensor: str
+    windows: Windows
+    intervals: list[tuple[int, int]]
+    near: BoolArray
+    lost: int
+    has_all_loss: bool
+
+    def findings(self) -> Iterator[Finding]:
+        """A finding for each of the first intervals, and one for the others."""
+        windows = self.windows
+        tail = f" All {number(self.lost, 'lost packet')} of {self.sensor} are of this time."
+        for first, end in self.intervals[:_MOST_STALLS]:
             begin_s = windows.seconds(first)
             end_s = windows.seconds(end - 1) + _length_s(windows, end - 1)
-            what = f"{name} sent nothing"
+            what = f"{self.sensor} sent nothing"
             if first == 0 and end == len(windows):
                 text = f"{what}: no column in any scan."
             elif first == 0:
@@ -199,10 +215,46 @@ def _stalls(windows: Windows) -> Iterator[Finding]:
                     f"{what} from +{begin_s:.1f} s to +{end_s:.1f} s: a stall of "
                     f"{number(end - first, 'scan')}."
                 )
+            if self.has_all_loss and len(self.intervals) == 1:
+                text += tail
             yield Finding(Level.PROBLEM, text, _POWER)
-        if len(intervals) > _MOST_STALLS:
-            more = len(intervals) - _MOST_STALLS
-            yield Finding(Level.PROBLEM, f"{number(more, 'more stall')} of {name}.", _POWER)
+        if len(self.intervals) > _MOST_STALLS:
+            more = len(self.intervals) - _MOST_STALLS
+            yield Finding(Level.PROBLEM, f"{number(more, 'more stall')} of {self.sensor}.", _POWER)
+
+
+def _stalls(report: RunReport, windows: Windows) -> list[_Stalls]:
+    """The stalls of each sensor that has some."""
+    found = []
+    for i, name in enumerate(windows.sensors):
+        silent: BoolArray = windows.columns[:, i] == 0
+        if windows.has_head and len(silent) > 1:
+            # Head and tail are partial: alone, they are no stall.
+            silent[0] &= silent[1]
+            silent[-1] &= silent[-2] | windows.complete[-1]
+        intervals = _intervals(silent)
+        if not intervals:
+            continue
+        near = silent.copy()
+        near[1:] |= silent[:-1]
+        near[:-1] |= silent[1:]
+        ledger = next((one.ledger for one in report.sensors if one.name == name), SensorLedger())
+        lost, accepted = ledger.packets.lost, max(1, ledger.packets.accepted)
+        # Columns that are missing near the stalls, and nowhere else, account for all packets.
+        per_packet = ledger.columns.decoded / accepted
+        missing = int((windows.expected - windows.columns)[near, i].sum())
+        is_all = missing + int(near.sum()) + per_packet >= lost * per_packet
+        elsewhere = windows.fill[~near & ~_is_partial(windows), i] < 1
+        has_all_loss = lost > 0 and is_all and not elsewhere.any()
+        found.append(_Stalls(name, windows, intervals, near, lost, has_all_loss))
+    return found
+
+
+def _is_partial(windows: Windows) -> BoolArray:
+    """Head and tail."""
+    partial: BoolArray = np.zeros(len(windows), np.bool_)
+    partial[0], partial[-1] = windows.has_head, windows.has_head and not windows.complete[-1]
+    return partial
 
 
 def _length_s(windows: Windows, row: int) -> float:
@@ -215,14 +267,14 @@ def _intervals(mask: BoolArray) -> list[tuple[int, int]]:
     return [(int(first), int(end)) for first, end in edges.reshape(-1, 2)]
 
 
-def _packets(report: RunReport) -> Iterator[Finding]:
-    warned = {one.sensor for one in report.warnings if one.code == "loss"}
+def _packets(report: RunReport, stalled: set[str]) -> Iterator[Finding]:
+    warned = stalled | {one.sensor for one in report.warnings if one.code == "loss"}
     for sensor in report.sensors:
         name = sensor.name
         packets = sensor.ledger.packets
         lost = packets.lost
         sent = packets.read + lost
-        # Else the warning states it.
+        # Else the warning, or the stall, states it.
         if lost and name not in warned:
             level = _level(lost, sent)
             text = f"{name} lost {number(lost, 'packet')} of {sent:,}, {percent(lost, sent)}."
@@ -294,7 +346,7 @@ def _faults(report: RunReport) -> Iterator[Finding]:
         yield Finding(Level.NOTE, f"Faults were injected by --fault: {texts}.")
 
 
-def _warnings(report: RunReport) -> Iterator[Finding]:
+def _warnings(report: RunReport, stalled: set[str]) -> Iterator[Finding]:
     losses = {
         sensor.name: _level(packets.lost, packets.lost + packets.read)
         for sensor in report.sensors
@@ -302,6 +354,8 @@ def _warnings(report: RunReport) -> Iterator[Finding]:
     }
     for one in report.warnings:
         code = one.code
+        if code == "loss" and one.sensor in stalled:
+            continue
         level = Level.WARNING
         # Other notes on a calibration say what was assumed, and contradict nothing.
         is_note = code == "calibration" and "expected" not in one.message

@@ -110,7 +110,7 @@
     const redraw = () => draw(canvas);
     timePlots.push(redraw);
     redraws.push(redraw);
-    let begun = null;
+    let begun = null, isDragged = false;
     const stepOf = (event) => {
       const box = canvas.getBoundingClientRect();
       const share = Math.max(0, Math.min(1, (event.clientX - box.left) / box.width));
@@ -120,12 +120,14 @@
       if (event.pointerType === "mouse") begun = { step: stepOf(event), x: event.clientX };
     });
     window.addEventListener("pointerup", (event) => {
-      if (begun && Math.abs(event.clientX - begun.x) > 6) {
+      isDragged = Boolean(begun) && Math.abs(event.clientX - begun.x) > 6;
+      if (isDragged) {
         const end = stepOf(event);
         setView(Math.min(begun.step, end), Math.max(begun.step, end));
       }
       begun = null;
     });
+    canvas.addEventListener("click", (event) => { if (!isDragged) showNearest(stepOf(event)); });
     canvas.addEventListener("dblclick", () => setView(0, total));
     canvas.addEventListener("pointermove", (event) => {
       const step = stepOf(event);
@@ -317,9 +319,17 @@
   // -- scans ------------------------------------------------------------------------------------
 
   const clouds = data.clouds;
+  let player = null;
   if (clouds.length) {
-    redraws.push(startPlayer(data, (number) =>
-      number < clouds.length ? unpackCloud(clouds[number]) : null, () => clouds.length - 1));
+    player = startPlayer(data, (number) =>
+      number < clouds.length ? unpackCloud(clouds[number]) : null, () => clouds.length - 1);
+    redraws.push(player.draw);
+  }
+
+  // Show the scan of the page that is nearest to a step.
+  function showNearest(step) {
+    const away = clouds.map((one) => Math.abs(one.middle - step));
+    if (player) player.choose(away.indexOf(Math.min(...away)));
   }
 
   // -- start ------------------------------------------------------------------------------------

@@ -5,7 +5,7 @@
 // ahead (scans to load while playing), is_played and spot (see `makeViewer`), pair (numbers of two
 // scans to flip between, instead of playing), colour. load(number): the unpacked
 // scan, perhaps later; null after the last; rejected with a reason that the page shows. last(): the
-// largest number known. Gives a function that draws again.
+// largest number known. Gives functions: draw again, choose a scan.
 function startPlayer(data, load, last) {
   const byId = (id) => document.getElementById(id);
   const canvas = byId("cloud"), slider = byId("scan"), play = byId("play");
@@ -16,7 +16,7 @@ function startPlayer(data, load, last) {
     say("This browser cannot unpack the points (no DecompressionStream): Chrome 103, " +
       "Firefox 113, Safari 16.4 and later can.");
     byId("stage").hidden = true;
-    return () => {};
+    return { draw: () => {}, choose: () => {} };
   }
   const viewer = makeViewer(canvas, data.sensors, data.poses, say, data.is_played, data.spot);
   const isFree = (colour) => !document.querySelector("[data-colour=" + colour + "]").disabled;
@@ -165,5 +165,5 @@ function startPlayer(data, load, last) {
   });
   new ResizeObserver(viewer.draw).observe(canvas);
   show(data.begin);
-  return viewer.draw;
+  return { draw: viewer.draw, choose };
 }

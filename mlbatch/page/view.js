@@ -21,7 +21,7 @@
     return unpackCloud({ ...head, data: bytes.subarray(4 + size) });
   }
 
-  const draw = startPlayer(data, load, () => Math.max(total || data.expected, loaded) - 1);
+  const { draw } = startPlayer(data, load, () => Math.max(total || data.expected, loaded) - 1);
   matchMedia("(prefers-color-scheme: dark)").addEventListener("change", draw);
   document.documentElement.dataset.drawn = Math.round(performance.now());
 })();

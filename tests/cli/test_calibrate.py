@@ -54,7 +54,7 @@ def test_a_rig_and_a_page(shell: Shell) -> None:
     assert np.abs(found - true)[:3, 3].max() < 0.005
     assert np.abs(found - true)[:3, :3].max() < np.deg2rad(0.1)
     page = Path("page.html").read_text(encoding="utf-8")
-    assert page.count("<svg") == 6
+    assert page.count("<svg") == page.count("</figcaption><svg") == 6
     assert "Surfaces of left and right are " in page
     # What it wrote can be used, and is not replaced by accident.
     assert shell(f"convert {DRIVE} --rig rig.yaml -o scans.mcap").code == 0

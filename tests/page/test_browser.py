@@ -14,6 +14,7 @@ import numpy.typing as npt
 import pytest
 
 from mlbatch.page import Source, write_page
+from mlbatch.page.templates import render
 from mlbatch.reports.report import RunReport
 from tests.builders.sessions import FIXTURE
 from tests.contract.tree import run_mlbatch
@@ -179,6 +180,9 @@ def test_colours_and_scans_can_be_chosen(tab: Browser, real_page: Path) -> None:
     wait_for(tab, SHOWN, "3")
     assert "middle" in tab.run("document.getElementById('cloudinfo').textContent")
     pictures.add(tab.run(POINTS))
+    # A click in the timeline shows the scan there, the last of seven.
+    tab.drag("#timeline", 0.93, 0.93)
+    wait_for(tab, SHOWN, "6")
     before = json.dumps(tab.run(POINTS))
     tab.drag("#cloud", 0.3, 0.6)
     wait_for(tab, f"{POINTS} !== {before} || null")
@@ -258,6 +262,25 @@ def test_a_browser_that_cannot_unpack_says_so(tab: Browser, real_page: Path) -> 
         assert tab.run("document.getElementById('stage').hidden")
     assert "no DecompressionStream" in why
     assert tab.errors == []
+
+
+@pytest.mark.parametrize("width", [1200, 400])
+def test_a_batch_fits_its_page(width: int, tab: Browser, tmp_path: Path) -> None:
+    """Cards fill their rows, and no cell of the table is cut."""
+    head = ("session", "state", "scans", "lost", "output", "time", "")
+    cells = dict(
+        zip(head, ("drive 1", "failed", "9", "0.00 %", "9.9 MB", "3 s", "x " * 90), strict=True)
+    )
+    row = {"cells": cells, "badge": "problem", "levels": dict.fromkeys(head, ""), "page": ""}
+    cards = {f"sessions with {number}": str(number) for number in range(11)}
+    path = tmp_path / "page.html"
+    path.write_text(render("batch.html", title="out", cards=cards, head=head, rows=[row] * 2))
+    tab.open(path, width=width)
+    rights = "[...document.querySelectorAll('.card')].map(c => c.getBoundingClientRect())"
+    (last, most) = tab.run(f"(b => [b.at(-1).right, Math.max(...b.map(c => c.right))])({rights})")
+    assert last == pytest.approx(most, abs=1)
+    scroll = "(s => s.scrollWidth - s.clientWidth)(document.querySelector('.scroll'))"
+    assert tab.run(scroll) <= 0
 
 
 def test_hostile_names_run_nothing(tab: Browser, tmp_path: Path) -> None:

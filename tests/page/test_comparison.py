@@ -149,6 +149,7 @@ def test_the_instant_is_in_words() -> None:
     # 50 ms at 10 m/s.
     assert "stands at two places 0.50 m apart (latest sweeps: 50 ms between the lidars)" in page
     assert "in the window: 0.00 m (0 ms)" in page
+    assert "At the worst place of the window: 0.00 m (0 ms)." in page
     without = _page(instant=_instant(has_clouds=False))
     assert "No merged clouds: rear without extrinsics." in without
     assert "latest sweeps, rear: 150.0 to 50.0 ms before the instant" in without
@@ -251,5 +252,10 @@ def test_it_is_drawn_in_a_browser(tab: Browser, tmp_path: Path, width: int, dark
     )
     assert len(plots) == 4
     assert all(wide > 300 and high > 40 and shapes >= 2 for wide, high, shapes in plots)
-    # Plots scroll, the page does not.
+    # Plots scroll and say so, the page does not.
+    hints = (
+        "[...document.querySelectorAll('.plot')].map(p => [getComputedStyle(p, '::before').content"
+    )
+    found = tab.run(f"{hints} !== 'none', p.scrollWidth > p.clientWidth])")
+    assert found == [[width == 400] * 2] * 4
     assert tab.run("document.documentElement.scrollWidth") <= width

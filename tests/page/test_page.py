@@ -306,6 +306,12 @@ def test_faults_are_in_the_heading(fault: str, texts: list[str], shell: Shell) -
     for words in texts:
         assert words in heading[1]
     assert "verdict problem" in page
+    if "stall" in fault:
+        # Nothing of it is that of the network; 16 columns in each of 96 packets.
+        assert "tcpdump" not in page
+        assert "never received 1,536 (35.4 %)" in page
+        data = plot_data(Path("page.html"))
+        assert "worst" in data["clouds"][data["begin"]]["text"]
 
 
 def test_hostile_names_are_text(shell: Shell) -> None:
