@@ -198,7 +198,7 @@ def compare(
         from mlbatch.comparison.instant import InstantFinder
 
         names = [*(policy.name for policy in policies), WINDOWS]
-        finder = InstantFinder(names, run.sensors, period_ns, run.plain_decoder)
+        finder = InstantFinder(names, run.sensors, period_ns, run.plain_scan)
         run.users.append(finder)
     cutters = [sweep_cutter(sensor) for sensor in run.sensors]
     joiner = Joiner(cutters, policies, period_ns, finder)

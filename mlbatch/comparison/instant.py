@@ -17,11 +17,10 @@ from mlbatch.batching.fusion import MOST_AGE_NS
 from mlbatch.batching.sweeps import Sweep, SweepSet, sweeps_of
 from mlbatch.batching.windows import Window
 from mlbatch.comparison.places import apart, cells, difference, spot_apart_ms
-from mlbatch.decode.decoder import Decoder, ScanHeader
 from mlbatch.page.instant import InstantSet, SharedInstant, Spot
 from mlbatch.page.points import CloudPoints
 from mlbatch.pipeline.sensor import Sensor
-from mlbatch.types import WindowColumns
+from mlbatch.types import Scan, WindowColumns
 from mlbatch.units import NS_PER_MS, NS_PER_S
 
 # Sets of an instant are complete by then: approximate time waits a sweep and its tolerance.
@@ -41,18 +40,14 @@ class InstantFinder:
         names: Sequence[str],
         sensors: Sequence[Sensor],
         period_ns: int,
-        new_decoder: Callable[[], Decoder],
+        decode: Callable[[WindowColumns, int, int], Scan],
     ) -> None:
-        """names: of the policies, then of windows.
-
-        new_decoder: called with the first instant; its scans are dense, with `column`.
-        """
+        """names: of the policies, then of windows; decode: `Conversion.plain_scan`."""
         self._best: SharedInstant | None = None
         self._names = names
         self._sensors = sensors
         self._period_ns = period_ns
-        self._new_decoder = new_decoder
-        self._decoder: Decoder | None = None
+        self._decode = decode
         self._windows: deque[Window] = deque()
         self._sets: list[deque[SweepSet]] = [deque() for _ in names[:-1]]
         self._first_ns = 0
@@ -159,8 +154,7 @@ class InstantFinder:
         rows = np.flatnonzero(np.logical_or.reduce(inside))
         some = columns.take(rows)
         start_ns, end_ns = int(some.stamp_ns[0]), int(some.stamp_ns[-1])
-        self._decoder = self._decoder or self._new_decoder()
-        scan = self._decoder.scan(some, ScanHeader(0, 0, start_ns, end_ns, True, 0))
+        scan = self._decode(some, start_ns, end_ns)
         time_ns = scan.time_ns.astype(np.int64) + (start_ns - window.end_ns)
         points = CloudPoints(scan.xyz, scan.lidar_id, time_ns, scan.ring, scan.intensity)
         return [points.take(one[rows][scan.column]) for one in inside]

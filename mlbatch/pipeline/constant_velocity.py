@@ -16,13 +16,12 @@ import numpy as np
 from mlbatch.arrays import F64Array, I64Array
 from mlbatch.batching.grid import Grid
 from mlbatch.batching.windows import Window
-from mlbatch.decode.decoder import Decoder, ScanHeader
 from mlbatch.motion.estimate import Estimate, VelocityEstimator
 from mlbatch.motion.moves import PoseLine
 from mlbatch.motion.registration import ORIGIN, ColumnCloud
 from mlbatch.motion.track import PoseTrack
 from mlbatch.reports.motion import MotionLedger, VelocityCounts
-from mlbatch.types import ImuSamples, Message, instant_ns
+from mlbatch.types import ImuSamples, Message, Scan, WindowColumns, instant_ns
 from mlbatch.units import NS_PER_S
 
 CONSTANT_VELOCITY = "constant-velocity"
@@ -42,15 +41,13 @@ class WindowCloud(NamedTuple):
 class WindowPoints:
     """Takes windows or their slices, reads points of some columns, yields whole windows."""
 
-    def __init__(self, grid: Grid, slots: list[int], new_decoder: Callable[[], Decoder]) -> None:
-        """slots: of a column of each sensor.
-
-        new_decoder: called with the first window; its scans are dense, with `column`.
-        """
+    def __init__(
+        self, grid: Grid, slots: list[int], decode: Callable[[WindowColumns, int, int], Scan]
+    ) -> None:
+        """slots: of a column of each sensor; decode: `Conversion.plain_scan`."""
         self._grid = grid
         self._slots = slots
-        self._new_decoder = new_decoder
-        self._decoder: Decoder | None = None
+        self._decode = decode
         # Slices of the window that is not complete, and their points.
         self._slices: list[Window] = []
         self._clouds: list[ColumnCloud] = []
@@ -97,12 +94,7 @@ class WindowPoints:
         some = columns.take(np.sort(np.concatenate(taken)))
         start_ns, end_ns = self._span_ns(window)
         time_s: F64Array = (some.stamp_ns - (start_ns + end_ns) // 2) / NS_PER_S
-        if self._decoder is None:
-            self._decoder = self._new_decoder()
-        header = ScanHeader(
-            window.index, window.slice, window.start_ns, window.end_ns, window.complete, 0
-        )
-        scan = self._decoder.scan(some, header)
+        scan = self._decode(some, window.start_ns, window.end_ns)
         if scan.column is None:
             raise TypeError("expected scans with columns")
         return ColumnCloud(scan.xyz.astype(np.float64), scan.column.astype(np.int64), time_s)

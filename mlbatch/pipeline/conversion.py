@@ -16,7 +16,7 @@ from mlbatch.batching.merge import ColumnMerge
 from mlbatch.batching.windows import OWN, Policy, Window
 from mlbatch.clocks.host_offset import remedies
 from mlbatch.clocks.timescale import common_timescale
-from mlbatch.decode.decoder import Decoder, Source
+from mlbatch.decode.decoder import Decoder, ScanHeader, Source
 from mlbatch.discovery.types import OUTPUT, Note
 from mlbatch.errors import NoScanError, PacketError, UsageError
 from mlbatch.pipeline import run_report
@@ -28,7 +28,15 @@ from mlbatch.pipeline.session import Session
 from mlbatch.reports.ledger import PointCounts
 from mlbatch.reports.poses import NOT_ASKED, ONE_LIDAR, PoseFigures
 from mlbatch.reports.scan_table import ScanTable
-from mlbatch.types import BYTE_INTENSITY, ImuSamples, Message, RunInfo, Scan, Topic
+from mlbatch.types import (
+    BYTE_INTENSITY,
+    ImuSamples,
+    Message,
+    RunInfo,
+    Scan,
+    Topic,
+    WindowColumns,
+)
 from mlbatch.units import NS_PER_MS, NS_PER_S, rate_text
 
 if TYPE_CHECKING:
@@ -168,6 +176,7 @@ class Conversion:
         self.users: list[PacketUser] = []
         self.dropped_incomplete = 0
         self.notes_before_points = 0
+        self._plain_decoder: Decoder | None = None
         self.deskew = self._deskew()
         self.imu_users: list[ImuUser] = [] if self.deskew is None else [self.deskew]
         self.poses = PoseFigures(ONE_LIDAR if job.checks_poses else NOT_ASKED)
@@ -207,7 +216,7 @@ class Conversion:
         )
 
         slots = [sensor.source().slots for sensor in self.sensors]
-        points = WindowPoints(self.grid, slots, self.plain_decoder)
+        points = WindowPoints(self.grid, slots, self.plain_scan)
         if job.deskew == CONSTANT_VELOCITY:
             return ConstantVelocity(job.deskew_to, points, len(self.sensors))
         from mlbatch.pipeline.deskew import IMU, Deskew, ImuPoses, Trajectory
@@ -225,7 +234,7 @@ class Conversion:
             return None
         from mlbatch.pipeline.pose_check import PoseCheck
 
-        return PoseCheck(self.sensors, self.job.slices, self.plain_decoder)
+        return PoseCheck(self.sensors, self.job.slices, self.plain_scan)
 
     def _topic_offset_ns(self, topic: Topic) -> int | None:
         """Scan clock minus receive time, as for messages of an IMU that are forwarded."""
@@ -234,14 +243,18 @@ class Conversion:
         is_epoch = common_timescale(self._timescales()) in _EPOCH_SCALES
         return self._scan_offset_ns() if is_epoch else None
 
-    def plain_decoder(self) -> Decoder:
-        """A decoder for the thread that batches: dense scans of all sensors, with columns."""
-        # There is a window, so that the clocks are known.
-        info = self._run_info()._replace(layout="dense", sort="columns")
-        sources = [sensor.source() for sensor in self.sensors]
-        boxes_m = self.session.boxes_m
-        extras = frozenset({"column"})
-        return Decoder(info, sources, boxes_m, extras)
+    def plain_scan(self, columns: WindowColumns, start_ns: int, end_ns: int) -> Scan:
+        """Decode columns in the thread that batches: a dense scan with `column`, without figures.
+
+        Its arrays are valid until the next one.
+        """
+        if self._plain_decoder is None:
+            # There is a window, so that the clocks are known.
+            info = self._run_info()._replace(layout="dense", sort="columns")
+            sources = [sensor.source() for sensor in self.sensors]
+            extras = frozenset({"column"})
+            self._plain_decoder = Decoder(info, sources, self.session.boxes_m, extras)
+        return self._plain_decoder.scan(columns, ScanHeader(0, 0, start_ns, end_ns, True, 0))
 
     # -- the loop -----------------------------------------------------------------------------
 

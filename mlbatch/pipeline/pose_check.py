@@ -12,22 +12,23 @@ from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 
-from mlbatch.arrays import F32Array, F64Array, I64Array, U8Array
-from mlbatch.decode.decoder import Decoder, ScanHeader
+from mlbatch.arrays import F64Array, I64Array
 from mlbatch.frames.transforms import from_rpy_deg
 from mlbatch.pipeline.sensor import Sensor
 from mlbatch.reports.poses import PoseFigures
+from mlbatch.types import Scan, WindowColumns
 from mlbatch.units import NS_PER_S
 
 if TYPE_CHECKING:
     from mlbatch.batching.windows import Window
     from mlbatch.poses.check import PoseComparison
+    from mlbatch.poses.solve import Cloud
 
 # Of a lidar in a window, until surfaces match and then; of more, every second column is read, or
 # every third.
 _SLOTS, _MORE_SLOTS = 1 << 14, 1 << 15
-# Points (n, 3) of a window or slice, their times (n,) in ns, their lidars (n,).
-_Points: TypeAlias = tuple[F32Array, I64Array, U8Array]
+# Points (n, 3) of a lidar in a window or slice, and their stamps (n,).
+_Points: TypeAlias = tuple[F64Array, I64Array]
 # Nearer points are of the machine, farther ones too sparse to show surfaces.
 _NEAREST_M, _FARTHEST_M = 1.0, 60.0
 
@@ -36,44 +37,44 @@ class PoseCheck:
     """Takes windows or their slices; `figures` once all are there."""
 
     def __init__(
-        self, sensors: Sequence[Sensor], slices: int, new_decoder: Callable[[], Decoder]
+        self,
+        sensors: Sequence[Sensor],
+        slices: int,
+        decode: Callable[[WindowColumns, int, int], Scan],
     ) -> None:
-        """slices: of a window; new_decoder: called with the first window that is read."""
+        """slices: of a window; decode: `Conversion.plain_scan`."""
         self._sensors = sensors
         self._slots = [sensor.source().slots for sensor in sensors]
-        self._origins_m = [sensor.body_from_sensor[:3, 3] for sensor in sensors]
         self._slices = slices
-        self._new_decoder = new_decoder
-        self._decoder: Decoder | None = None
+        self._decode = decode
         self._comparison: PoseComparison | None = None
         self._is_over = False
         # Windows so far, and the number of the next one that begins a place.
         self._windows = -1
-        self._index: int | None = None
         self._next = 1
-        # Windows of a place by index.
-        self._place: dict[int, list[_Points]] = {}
+        # Indexes of the newest window, and of the first window of a place that is not complete,
+        # with its end.
+        self._index: int | None = None
+        self._begun: int | None = None
+        self._instant_ns = 0
+        # Slices of the newest window, if it is read.
+        self._parts: list[list[_Points]] = []
 
     def add(self, window: Window) -> None:
         """Add the next window, or slice."""
         if self._is_over or window.is_partial:
             return
         if window.index != self._index:
-            self._index = window.index
             self._windows += 1
-            if self._windows < self._next:
-                return
-            if not self._place or window.index - 1 in self._place:
-                self._place[window.index] = []
-            else:
-                self._place = {window.index: []}
-        if window.index not in self._place:
+            self._index = window.index
+            self._parts = []
+            if self._begun != window.index - 1:
+                self._begun = None
+        if self._windows < self._next:
             return
-        self._place[window.index].append(self._points(window))
-        if len(self._place) == 2 and window.slice == self._slices - 1:
+        self._parts.append([self._points(window, lidar) for lidar in range(len(self._sensors))])
+        if window.slice == self._slices - 1:
             self._compare(window)
-            self._place = {}
-            self._next = 2 * self._next + 1
 
     @property
     def is_over(self) -> bool:
@@ -82,56 +83,53 @@ class PoseCheck:
 
     def figures(self) -> PoseFigures:
         """What is known of each pair of lidars."""
-        if self._comparison is None:
+        if self._comparison is None or not self._comparison.places:
             return PoseFigures("fewer than three windows")
         return PoseFigures(pairs=self._comparison.figures())
 
-    def _points(self, window: Window) -> _Points:
-        """Points of some columns; columns of a sensor are taken at equal steps."""
-        columns = window.columns
-        is_common = self._comparison is not None and self._comparison.is_common
-        most = _MORE_SLOTS if is_common else _SLOTS
-        taken: list[I64Array] = []
-        for number, slots in enumerate(self._slots):
-            rows = np.flatnonzero(columns.sensor == number)
-            step = max(1, round(len(rows) * slots * self._slices / most))
-            taken.append(rows[::step])
-        some = columns.take(np.sort(np.concatenate(taken)))
-        if self._decoder is None:
-            self._decoder = self._new_decoder()
-        header = ScanHeader(
-            window.index, window.slice, window.start_ns, window.end_ns, window.complete, 0
-        )
-        scan = self._decoder.scan(some, header)
-        stamp_ns = scan.time_ns.astype(np.int64) + window.start_ns
-        return scan.xyz.copy(), stamp_ns, scan.lidar_id.copy()
+    def _points(self, window: Window, lidar: int) -> _Points:
+        """Points of a lidar in columns at equal steps."""
+        needs_more = self._comparison is not None and self._comparison.needs_more
+        most = _MORE_SLOTS if needs_more else _SLOTS
+        rows = np.flatnonzero(window.columns.sensor == lidar)
+        step = max(1, round(len(rows) * self._slots[lidar] * self._slices / most))
+        scan = self._decode(window.columns.take(rows[::step]), window.start_ns, window.end_ns)
+        away_m = scan.xyz - self._sensors[lidar].body_from_sensor[:3, 3].astype(np.float32)
+        squared = np.einsum("ni,ni->n", away_m, away_m)
+        kept = (squared > _NEAREST_M**2) & (squared < _FARTHEST_M**2)
+        return scan.xyz[kept].astype(np.float64), scan.time_ns[kept] + np.int64(window.start_ns)
 
-    def _compare(self, last: Window) -> None:
-        """Compare the clouds of a place."""
+    def _compare(self, window: Window) -> None:
+        """Compare the clouds of a window that is complete."""
         # Loaded once there is something to compare.
         from mlbatch.poses.check import PoseComparison
-        from mlbatch.poses.solve import Cloud
 
         if self._comparison is None:
             names = [sensor.name for sensor in self._sensors]
             poses = [sensor.body_from_sensor for sensor in self._sensors]
             self._comparison = PoseComparison(names, poses, _as_radians(self._sensors))
+        if self._begun is None:
+            self._instant_ns = window.end_ns
+            needs_next = self._comparison.begin(self._clouds())
+            self._begun = window.index if needs_next else None
+        else:
+            self._comparison.complete(self._clouds())
+            self._begun = None
+        if self._begun is None:
+            self._next = 2 * self._next + 1
+            self._is_over = self._comparison.is_settled
+
+    def _clouds(self) -> list[Cloud]:
+        """The points of each lidar in the newest window."""
+        from mlbatch.poses.solve import Cloud
+
         clouds = []
-        for parts in self._place.values():
-            points_m, stamp_ns, lidar = (
-                np.concatenate(arrays) for arrays in zip(*parts, strict=True)
-            )
-            time_s = (stamp_ns - last.start_ns) / NS_PER_S
-            for number, origin_m in enumerate(self._origins_m):
-                own = np.flatnonzero(lidar == number)
-                away_m = points_m[own] - origin_m.astype(np.float32)
-                squared = np.einsum("ni,ni->n", away_m, away_m)
-                rows = own[(squared > _NEAREST_M**2) & (squared < _FARTHEST_M**2)]
-                clouds.append(
-                    Cloud(number, points_m[rows].astype(np.float64), time_s[rows], origin_m)
-                )
-        self._comparison.add(clouds)
-        self._is_over = self._comparison.is_settled
+        for lidar, parts in enumerate(zip(*self._parts, strict=True)):
+            points_m, stamp_ns = map(np.concatenate, zip(*parts, strict=True))
+            origin_m = self._sensors[lidar].body_from_sensor[:3, 3]
+            time_s = (stamp_ns - self._instant_ns) / NS_PER_S
+            clouds.append(Cloud(lidar, points_m, time_s, origin_m))
+        return clouds
 
 
 def _as_radians(sensors: Sequence[Sensor]) -> list[F64Array] | None:

@@ -7,7 +7,7 @@ stays without any single place.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import combinations
 from typing import NamedTuple
@@ -90,24 +90,41 @@ _STEPS = 8
 _ALONG_AXIS = 0.9
 
 
-@dataclass(eq=False, repr=False)
-class _Pair:
-    """Surfaces of two lidars in all places: in both, in the one that has fewer, that fit."""
+class _Shared(NamedTuple):
+    """Surfaces of two lidars: in both, in the one that has fewer, that fit."""
 
-    both: int = 0
-    fewer: int = 0
-    fit: int = 0
+    both: int
+    fewer: int
+    fit: int
 
-    def add(self, first: Planes, second: Planes) -> None:
+    @classmethod
+    def of(cls, first: Planes, second: Planes) -> _Shared:
         """Count the surfaces of two clouds of one window."""
         left, right = shared_cells(first, second)
         apart_m = second.mean_m[right] - first.mean_m[left]
         cosine = np.abs((first.normal[left] * second.normal[right]).sum(axis=1))
         distance_m = np.abs((first.normal[left] * apart_m).sum(axis=1))
         fits = (cosine >= _MIDDLE.parallel) & (distance_m <= _MIDDLE.most_m)
-        self.both += len(left)
-        self.fewer += min(len(first.key), len(second.key))
-        self.fit += int(np.count_nonzero(fits))
+        fewer = min(len(first.key), len(second.key))
+        return cls(len(left), fewer, int(np.count_nonzero(fits)))
+
+    def plus(self, other: _Shared) -> _Shared:
+        """The surfaces of this and of another window."""
+        return _Shared(*map(sum, zip(self, other, strict=True)))
+
+    @property
+    def is_misfit(self) -> bool:
+        """Whether there are enough, and they do not fit."""
+        return self.both >= _LEAST_SURFACES and self.fit < _FITS * self.both
+
+
+class _Begun(NamedTuple):
+    """A place of which the first window is there: its motion, planes and what lidars share."""
+
+    first: Place
+    state: State
+    surfaces: list[list[Planes]]
+    shared: list[_Shared]
 
 
 class _Estimate(NamedTuple):
@@ -138,7 +155,11 @@ class PoseComparison:
         self._poses = body_from_sensor
         self._as_radians = as_radians
         self._tries_others = tries_others
-        self._pairs = {pair: _Pair() for pair in combinations(range(len(names)), 2)}
+        self._pairs = list(combinations(range(len(names)), 2))
+        self._shared = [_Shared(0, 0, 0)] * len(self._pairs)
+        # Places so far, of which some have nothing in common.
+        self.places = 0
+        self._begun: _Begun | None = None
         self._places: list[Place] = []
         self._rows: list[Rows] = []
         # Corrections and twists that the rows were matched with.
@@ -148,13 +169,8 @@ class PoseComparison:
         # Whether planes of some points were too little.
         self._needs_stems = False
         self._needs_all = False
-        # Whether lidars see something in common, so that more points pay.
-        self.is_common = False
-
-    @property
-    def places(self) -> int:
-        """Places so far."""
-        return len(self._rows)
+        # Whether more points of a window would pay.
+        self.needs_more = False
 
     @property
     def is_settled(self) -> bool:
@@ -166,24 +182,44 @@ class PoseComparison:
         pairs = self._measured()
         if all(pair.surfaces <= _STRAY * self.places for pair in pairs):
             return True
-        return all(map(self._is_clear, pairs)) and not any(
-            pair.undetermined and not pair.is_wrong for pair in pairs
-        )
+        return self._are_clear(pairs)
 
     def add(self, place: Place) -> None:
         """Compare the clouds of a place: a cloud of each lidar in a window, then in the next."""
+        if self.begin(place[: len(self._names)]):
+            self.complete(place[len(self._names) :])
+
+    def begin(self, first: Place) -> bool:
+        """Begin a place with a cloud of each lidar; whether the next window is needed as well."""
         state = State.start(len(self._names), 1)
         # A vehicle hardly changes its velocity from place to place.
-        state.twists[:] = self._state.twists[-1:] if self.places else 0.0
-        self._places.append(self._used(place))
-        self._rows.append(self._matched(self._places[-1], state, counts=True))
-        self._state.twists = np.vstack([self._state.twists, state.twists])
+        if self._rows:
+            state.twists[:] = self._state.twists[-1:]
+        surfaces = self._planes(first, state)
+        shared = self._count(surfaces)
+        self._begun = _Begun(first, state, surfaces, shared)
+        if any(one.both > _STRAY for one in shared) or self._may_be_mistaken(first):
+            return True
+        self._end_place()
+        return False
+
+    def complete(self, second: Place) -> None:
+        """Complete a place with the next window."""
+        if self._begun is None:
+            raise ValueError("expected a place that was begun")
+        first, state, surfaces, shared = self._begun
+        self._is_misfit |= any(one.is_misfit for one in shared)
+        self._end_place()
+        place = [*first, *second]
         self._joined = None
+        self._places.append(self._used(place))
+        surfaces += self._planes(second, state)
+        self._rows.append(self._matched(self._places[-1], state, surfaces))
+        self._state.twists = np.vstack([self._state.twists, state.twists])
         across = _across(self._rows[-1])
         if across <= _CHANCE:
             # Nothing is in common; stems would add nothing either.
             return
-        self.is_common = True
         self._joined = self._estimate()
         if self._joined.weak >= _WEAK and not self._needs_stems:
             self._needs_stems = True
@@ -191,6 +227,26 @@ class PoseComparison:
             self._rows[-1] = self._matched(self._places[-1], state)
             self._joined = self._estimate()
         self._needs_all |= across < _FEW_SURFACES
+        self.needs_more = not self._are_clear(self._measured())
+
+    def _end_place(self) -> None:
+        """Count the surfaces of a place that is complete."""
+        if self._begun is not None:
+            both = zip(self._shared, self._begun.shared, strict=True)
+            self._shared = [so_far.plus(shared) for so_far, shared in both]
+            self.places += 1
+            self._begun = None
+
+    def _planes(self, clouds: Place, state: State) -> list[list[Planes]]:
+        return Problem([clouds], len(self._names)).planes(0, state, self._level[0])
+
+    def _count(self, surfaces: Sequence[Sequence[Planes]]) -> list[_Shared]:
+        """What each two lidars share in a window."""
+        counted = self._level[1]
+        return [
+            _Shared.of(surfaces[one][counted], surfaces[other][counted])
+            for one, other in self._pairs
+        ]
 
     def _used(self, place: Place) -> Place:
         """A place with what is needed of it."""
@@ -201,41 +257,32 @@ class PoseComparison:
         """How surfaces are matched, and which size of cells is counted."""
         return _RICH if self._needs_all else _LIGHT
 
-    def _matched(self, place: Place, state: State, *, counts: bool = False) -> Rows:
-        """Match the surfaces of a place, with a motion that is put into the state."""
+    def _matched(
+        self, place: Place, state: State, surfaces: Sequence[Sequence[Planes]] | None = None
+    ) -> Rows:
+        """Match the surfaces of a place, with a motion that is put into the state.
+
+        surfaces: by that motion, if they are known.
+        """
         problem = Problem([place], len(self._names))
-        level, counted = self._level
-        for attempt in range(_MOST_MATCHES):
-            surfaces = problem.planes(0, state, level)
-            rows = problem.place_rows(0, state, level, surfaces)
-            if counts and not attempt:
-                self._is_misfit |= self._count([sizes[counted] for sizes in surfaces])
+        level = self._level[0]
+        for _ in range(_MOST_MATCHES):
+            rows = problem.place_rows(0, state, level, surfaces or problem.planes(0, state, level))
             if _across(rows) <= _CHANCE:
                 break
             twists = estimate(problem, [rows], state).state.twists
             if float(np.abs(twists - state.twists).max(initial=0.0)) * _BETWEEN_S <= _FAST_M:
                 break
-            state.twists = twists
+            state.twists, surfaces = twists, None
         return rows
 
     def _estimate(self, without: int | None = None) -> _Estimate:
         """The corrections by all places, or by all but one."""
-        used = [number for number in range(self.places) if number != without]
+        used = [number for number in range(len(self._rows)) if number != without]
         state = replace(self._state, twists=self._state.twists[used])
         rows = [self._rows[number] for number in used]
         problem = Problem([], len(self._names))
         return _estimate(estimate(problem, rows, state, most_sigma_m=_MOST_SIGMA_M))
-
-    def _count(self, surfaces: Sequence[Planes]) -> bool:
-        """Count the surfaces of the first window; return whether a pair's do not fit."""
-        misfit = False
-        for (one, other), pair in self._pairs.items():
-            now = _Pair()
-            now.add(surfaces[one], surfaces[other])
-            misfit |= now.both >= _LEAST_SURFACES and now.fit < _FITS * now.both
-            pair.both, pair.fewer = pair.both + now.both, pair.fewer + now.fewer
-            pair.fit += now.fit
-        return misfit
 
     def figures(self) -> tuple[PairFigures, ...]:
         """What is known of each pair."""
@@ -249,7 +296,7 @@ class PoseComparison:
         """Match surfaces anew where something seems to be off: one linear step may be too short."""
         if self._joined is None or not (self._is_misfit or _seems_off(self._joined)):
             return
-        if all(self._is_far_off(pair) for pair in self._pairs.values() if pair.both):
+        if all(self._is_far_off(pair) for pair in self._shared if pair.both):
             # What does not fit at all is not measured.
             return
         problem, level = Problem(self._places, len(self._names)), self._level[0]
@@ -263,19 +310,55 @@ class PoseComparison:
         """Figures with the mistake that explains them, if one does."""
         if pair.outcome == MEASURED and not pair.undetermined:
             return pair
-        exchanged = list(self._poses)
-        exchanged[key[0]], exchanged[key[1]] = self._poses[key[1]], self._poses[key[0]]
-        for cause, poses in ((EXCHANGED, exchanged), (RADIANS, self._as_radians)):
-            if poses is not None and self._fits(key, poses, is_whole=not pair.is_wrong):
+        for cause, poses in self._others(key):
+            if self._fits(key, poses, is_whole=not pair.is_wrong):
                 # That they fit in all directions is proof, too.
                 outcome = pair.outcome if pair.is_wrong else MISFIT
                 return pair._replace(outcome=outcome, reason="", fits_with=cause)
         return pair
 
+    def _others(self, key: tuple[int, int]) -> Iterator[tuple[str, Sequence[F64Array]]]:
+        """Mistakes that two lidars may suffer from, and the poses without them."""
+        one, other = key
+        exchanged = list(self._poses)
+        exchanged[one], exchanged[other] = self._poses[other], self._poses[one]
+        yield EXCHANGED, exchanged
+        if self._as_radians is not None:
+            yield RADIANS, self._as_radians
+
+    def _may_be_mistaken(self, first: Place) -> bool:
+        """Whether lidars that share nothing in the first window may do so without a mistake."""
+        if self.places or not self._tries_others:
+            return False
+        for key in self._pairs:
+            for _, poses in self._others(key):
+                if self._alone(key, poses).begin(self._with_poses(first, key, poses)):
+                    return True
+        return False
+
+    def _alone(self, key: tuple[int, int], poses: Sequence[F64Array]) -> PoseComparison:
+        """A comparison of two lidars alone: others would cost more and say little."""
+        names, chosen = [self._names[lidar] for lidar in key], [poses[lidar] for lidar in key]
+        return PoseComparison(names, chosen, tries_others=False)
+
+    def _with_poses(
+        self, clouds: Place, key: tuple[int, int], poses: Sequence[F64Array]
+    ) -> list[Cloud]:
+        """Clouds of two lidars as if they had been converted with other poses."""
+        moves = [poses[lidar] @ np.linalg.inv(self._poses[lidar]) for lidar in key]
+        both = [cloud for cloud in clouds if cloud.lidar in key]
+        return [_moved(cloud, key.index(cloud.lidar), moves) for cloud in both]
+
     def _measured(self) -> tuple[PairFigures, ...]:
-        if self._joined is None and self.places:
+        if self._joined is None and self._rows:
             self._joined = self._estimate()
-        return tuple(self._figures(key, pair) for key, pair in self._pairs.items())
+        return tuple(map(self._figures, self._pairs, self._shared))
+
+    def _are_clear(self, pairs: Sequence[PairFigures]) -> bool:
+        """Whether all pairs are proven to be right or wrong."""
+        return all(map(self._is_clear, pairs)) and not any(
+            pair.undetermined and not pair.is_wrong for pair in pairs
+        )
 
     @staticmethod
     def _is_clear(pair: PairFigures) -> bool:
@@ -287,7 +370,7 @@ class PoseComparison:
         turn_deg = (pair.turn_deg or 0.0) + _PROOF * (pair.turn_deviation_deg or 0.0)
         return shift_m <= LIMIT_M and np.deg2rad(turn_deg) <= LIMIT_RAD
 
-    def _figures(self, key: tuple[int, int], pair: _Pair) -> PairFigures:
+    def _figures(self, key: tuple[int, int], pair: _Shared) -> PairFigures:
         joined = self._joined
         names = self._names[key[0]], self._names[key[1]]
         if not pair.both:
@@ -314,7 +397,10 @@ class PoseComparison:
         if is_off and ((shift.size or 0.0) > _MOST_M or (turn.size or 0.0) > _MOST_RAD):
             return figures._replace(outcome=MISFIT)
         if not is_off and (shift.is_beyond or turn.is_beyond):
-            return figures._replace(reason="what is seen in one place contradicts the others")
+            reason = "what is seen in one place contradicts the others"
+            if len(self._rows) < _LEAST_PLACES:
+                reason = "one place alone does not prove that they are apart"
+            return figures._replace(reason=reason)
         return figures._replace(
             outcome=OFF if is_off else MEASURED,
             shift_mm=None if shift.size is None else round(1000 * shift.size, 1),
@@ -329,7 +415,7 @@ class PoseComparison:
             ),
         )
 
-    def _is_far_off(self, pair: _Pair) -> bool:
+    def _is_far_off(self, pair: _Shared) -> bool:
         """Whether so few surfaces fit that the poses cannot be measured."""
         return pair.fit < _MISFIT * pair.both and self.places >= _LEAST_PLACES
 
@@ -356,7 +442,9 @@ class PoseComparison:
 
     def _agree(self, along: F64Array, limit: float, most: float) -> bool:
         """Whether a residual along a direction of the corrections (u,) rests on no single place."""
-        for number in range(self.places):
+        if len(self._rows) < _LEAST_PLACES:
+            return False
+        for number in range(len(self._rows)):
             rest = self._estimate(number)
             if float(along @ rest.covariance @ along) > (2 * most) ** 2:
                 return False
@@ -382,16 +470,12 @@ class PoseComparison:
 
         is_whole: all directions have to be determined.
         """
-        if self.places < _LEAST_PLACES:
+        if len(self._places) < _LEAST_PLACES:
             return False
-        # Of two lidars alone: others would cost more and say little.
-        names, chosen = [self._names[lidar] for lidar in key], [poses[lidar] for lidar in key]
-        moves = [poses[lidar] @ np.linalg.inv(self._poses[lidar]) for lidar in key]
-        comparison = PoseComparison(names, chosen, tries_others=False)
+        comparison = self._alone(key, poses)
         for place in self._places[:_KEPT]:
-            both = [cloud for cloud in place if cloud.lidar in key]
-            comparison.add([_moved(cloud, key.index(cloud.lidar), moves) for cloud in both])
-            if comparison._is_misfit:
+            comparison.add(self._with_poses(place, key, poses))
+            if comparison._is_misfit or not comparison._rows:
                 return False
         (figures,) = comparison.figures()
         return (

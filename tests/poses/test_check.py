@@ -152,6 +152,12 @@ def test_the_reason_why_nothing_was_compared(options: dict[str, Any], reason: st
     assert poses.describe() == f"poses: not checked ({reason})"
 
 
+def test_one_place_alone_proves_nothing(tmp_path: Path) -> None:
+    poses, warnings = checked(rig_with(moved("translation_m", 1, 0.06), tmp_path), end="+0.3s")
+    assert (poses.pairs[0].outcome, warnings) == (NOT_CHECKED, [])
+    assert "one place alone" in poses.describe()
+
+
 def test_lidars_without_common_surfaces_are_not_checked(tmp_path: Path) -> None:
     poses, warnings = checked(
         rig_with(lambda extrinsics: extrinsics[1]["translation_m"].__setitem__(0, 90.0), tmp_path)
