@@ -13,7 +13,6 @@ import numpy as np
 from mlbatch.arrays import F64Array
 
 FOLDER = Path(__file__).resolve().parents[2] / "fixtures" / "two_lidars"
-COLUMNS_PER_PACKET = 16
 BEAMS = 32
 # 2026-05-04T08:00:00 UTC; the recording begins 20 ms later.
 SECOND_NS = 1_777_881_600_000_000_000

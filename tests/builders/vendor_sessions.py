@@ -12,7 +12,7 @@ import numpy as np
 from mlbatch.simulate.hesai.angles import angles_csv
 from mlbatch.simulate.robosense import encode as robosense
 from tests.builders import livox
-from tests.builders.bags import Body, Recorded
+from tests.builders.bags import Recorded
 from tests.builders.captures import udp_frame, write_pcap
 from tests.builders.lidar_packets import Payloads, Spec, even
 from tests.builders.messages import Unit as Sender
@@ -70,16 +70,6 @@ def robosense_csv(path: Path, channels: int) -> None:
 def rslidar_messages(payloads: Payloads, topic: str = "/rslidar_packets") -> list[Recorded]:
     """Point and device packets on one topic, as the vendor's driver publishes them."""
     return messages(Sender("robosense", topic, sorted(payloads)), "cdr")
-
-
-def robosense_scan(payloads: Payloads) -> bytes:
-    """A robosense_msgs/RobosenseScan of a branch of Nebula: packets of 1500 bytes and a size."""
-    body = Body("cdr").header(payloads[0][0], "robosense").put("I", len(payloads))
-    for host_ns, payload in payloads:
-        is_difop = payload.startswith(robosense.DIFOP_MAGIC)
-        body.time(host_ns).put("B", is_difop).raw(payload.ljust(1500, b"\0"))
-        body.put("I", len(payload))
-    return body.done()
 
 
 def ouster(turns: int = 3) -> Unit:

@@ -132,13 +132,6 @@ def test_the_options_are_those_of_the_contract(command: str) -> None:
             assert "repeatable" in (getattr(parameter, "help", None) or ""), parameter.opts
 
 
-@pytest.mark.parametrize("command", OPTIONS)
-def test_help_shows_every_option(command: str) -> None:
-    page = _help(command)
-    for name in OPTIONS[command]:
-        assert re.search(rf"{name}\b", page), name
-
-
 @pytest.mark.parametrize("command", COMMON)
 def test_long_commands_show_what_people_use(command: str) -> None:
     result = CliRunner().invoke(command_line(command), [command, "-h"], env={"COLUMNS": "100"})
@@ -229,14 +222,6 @@ def test_a_shell_completes_words_of_options() -> None:
             "main()\n"
         )
         assert words <= set(printed.split()), option
-
-
-def test_help_loads_nothing_heavy() -> None:
-    loaded = run_python(
-        "import sys\nfrom mlbatch.cli.app import command_line\ncommand_line()\n"
-        f"print([name for name in {HEAVY!r} if name in sys.modules])"
-    )
-    assert loaded.strip() == "[]"
 
 
 def test_drawn_help_loads_no_parser_of_markdown() -> None:

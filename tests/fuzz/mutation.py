@@ -116,6 +116,12 @@ def _splice(rng: random.Random, data: bytearray, seeds: Seeds) -> None:
         data[at : at + len(part)] = part
 
 
+def _fill(rng: random.Random, data: bytearray, seeds: Seeds) -> None:
+    """One value alone, after the bytes that identify a vendor."""
+    keep = rng.choice((0, 8, 16, 64))
+    data[keep:] = bytes([rng.choice((0, 0x7F, 0x80, 0xFF))]) * max(len(data) - keep, 0)
+
+
 def _cut(rng: random.Random, data: bytearray, seeds: Seeds) -> None:
     if rng.random() < 0.5:
         del data[_place(rng, data) :]
@@ -125,7 +131,7 @@ def _cut(rng: random.Random, data: bytearray, seeds: Seeds) -> None:
 
 CHANGES: tuple[Change, ...] = (
     *(_flip, _set, _extreme, _extreme, _lie, _lie, _lie),
-    *(_remove, _insert, _repeat, _move, _splice, _cut),
+    *(_remove, _insert, _repeat, _move, _splice, _cut, _fill),
 )
 
 # -- texts ----------------------------------------------------------------------------------------

@@ -35,7 +35,6 @@ from tests.builders.rosbag2 import Form, write_folder, write_rosbag2
 from tests.builders.traffic import frames
 from tests.fuzz.harness import BrokenLaw, Target
 from tests.fuzz.mutation import Seeds, mutated, mutated_text
-from tests.reference.capture import ODD, dissect, pcap_frames
 
 # Enough for fragments of both lidars and for packets of every kind.
 _RECORDS = 40
@@ -80,30 +79,6 @@ def _read_file(name: str, data: bytes, folder: Path) -> None:
     if isinstance(recording, CaptureRecording):
         recording.buffer_bytes = _BUFFERS[len(data) % len(_BUFFERS)]
     read_all(recording, streams)
-
-
-def _literally(data: bytes, folder: Path) -> None:
-    """A capture has the packets that the literal dissector finds in it."""
-    path = folder / "a.pcap"
-    path.write_bytes(data)
-    streams = StreamTable()
-    recording = open_recording(path, streams)
-    if not isinstance(recording, CaptureRecording) or recording.container != "pcap":
-        return
-    recording.buffer_bytes = _BUFFERS[len(data) % len(_BUFFERS)]
-    found: list[tuple[int, str, bytes]] = []
-    for batch in recording.packets():
-        check_batch(batch, streams)
-        rows = zip(batch.start, batch.size, batch.stream, batch.host_ns, strict=True)
-        found += [
-            (int(at_ns), str(streams.streams[stream]), batch.data[at : at + size].tobytes())
-            for at, size, stream, at_ns in rows
-        ]
-    expected, skipped = dissect(pcap_frames(data))
-    if ODD in skipped:
-        return
-    if (found, recording.counts.skipped) != (expected, skipped):
-        raise BrokenLaw("other packets than the literal dissector finds")
 
 
 # -- captures -------------------------------------------------------------------------------------
@@ -316,11 +291,9 @@ def _file_target(
 TARGETS: Sequence[Target] = (
     _file_target("pcap", _pcaps, share=14),
     _file_target("pcapng", _pcapngs, share=14),
-    Target("read pcap, compiled", _pcaps, _literally, mutated, 8),
     _file_target("compressed", _containers, _compressed),
     _file_target("mcap", _mcaps, mutated_mcap, share=14),
     _file_target("bag", _bags, share=12),
     _file_target("db3", _databases, share=12),
     Target("read folder", _metadata, _read_folder, mutated_text, 3),
 )
-__all__ = ["TARGETS", "check_batch", "mutated_mcap", "read_all"]

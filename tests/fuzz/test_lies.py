@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import json
-import re
 import sqlite3
 import struct
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -22,12 +20,11 @@ from mlbatch.types import StreamTable, Topic
 from tests.builders.bags import Recorded, packet_message
 from tests.builders.rosbag2 import Form, write_folder, write_rosbag2
 from tests.builders.run import command
-from tests.fuzz import packets, readers
-from tests.fuzz.framing import Part, joined, parts_of
+from tests.fuzz import packets
+from tests.fuzz.framing import Part, joined
 from tests.fuzz.harness import Target, campaign, fault_of_line
 
 OUSTER = "ouster_sensor_msgs/PacketMsg"
-COUNTS = (0, 1, 0xFFFF, 0x7FFFFFFF, 0x80000000, 0xFFFFFFFF)
 
 
 def check(seeds: Sequence[bytes], run: Callable[[bytes, Path], None]) -> None:
@@ -35,34 +32,6 @@ def check(seeds: Sequence[bytes], run: Callable[[bytes, Path], None]) -> None:
     tally = campaign(Target("lies", lambda: seeds, run), range(len(seeds)))
     assert tally.inputs == len(seeds)
     assert not tally.failures, str(tally.failures[0])
-
-
-def with_counts(data: bytes, width: int, order: str) -> Iterator[bytes]:
-    """The data with every of the counts at every place of a head."""
-    pack = struct.Struct(order + {2: "H", 4: "I", 8: "Q"}[width])
-    for at in range(min(len(data) - width, 120)):
-        for count in COUNTS:
-            value = count if width < 8 else count << 32 | count
-            yield data[:at] + pack.pack(value & (1 << 8 * width) - 1) + data[at + width :]
-
-
-@pytest.mark.parametrize("order", ["<", ">"])
-@pytest.mark.parametrize("name", ["pcap", "pcapng", "mcap", "bag"])
-def test_every_length_in_a_head_may_lie(name: str, order: str) -> None:
-    target = next(one for one in readers.TARGETS if one.name == f"read {name}")
-    seed = min(target.seeds(), key=lambda data: (len(data) < 600, len(data)))
-    seeds = [wrong for width in (4, 8) for wrong in with_counts(seed, width, order)]
-    check(seeds[::7], target.run)
-
-
-def test_every_count_of_a_message_may_lie() -> None:
-    whole = packet_message("cdr", bytes(range(100)))
-
-    def run(data: bytes, folder: Path) -> None:
-        array = np.frombuffer(data + bytes(128), np.uint8)
-        Unpacker(Topic("/a", OUSTER, "cdr")).find(array, 0, len(data), 0)
-
-    check(list(with_counts(whole, 4, "<")), run)
 
 
 # -- definitions ----------------------------------------------------------------------------------
@@ -251,43 +220,6 @@ def test_yaml_is_never_more_than_plain_values(name: str) -> None:
         assert "cannot be read" in open_recording(bag, StreamTable()).notes[0]
 
     check([YAML[name].encode()], run)
-
-
-NUMBER = re.compile(rb"(?<![\w.])-?\d+(\.\d+)?(e[-+]?\d+)?(?![\w.])", re.IGNORECASE)
-WORDS = (b"NaN", b".nan", b"-Infinity", b".inf", b"1e999", b"-1e308", b"4294967295", b"-1")
-
-
-@pytest.mark.parametrize("suffix", [".json", ".yaml", ".xml", ".csv"])
-def test_numbers_of_a_calibration_that_are_none(suffix: str) -> None:
-    """Each of the first numbers of a file one by one, then all of them at once."""
-    target = next(one for one in packets.TARGETS if one.name == f"calibration {suffix}")
-    wrong_seeds = []
-    for seed in sorted(target.seeds(), key=len)[:2]:
-        places = [found.span() for found in NUMBER.finditer(seed)][:30]
-        for word in WORDS:
-            wrong_seeds.append(NUMBER.sub(word, seed))
-            wrong_seeds += [seed[:begin] + word + seed[end:] for begin, end in places]
-    check(wrong_seeds, target.run)
-
-
-@pytest.mark.parametrize("vendor", ["velodyne", "hesai", "robosense", "livox", "ouster"])
-def test_packets_of_one_value_alone(vendor: str) -> None:
-    """Packets that are zeros, or ones, after the bytes that identify their vendor."""
-    target = next(one for one in packets.TARGETS if one.name == f"packets {vendor}")
-    seeds = target.seeds()[:: 4 if vendor != "livox" else 1]
-    shapes = [(keep, value) for value in (0, 0xFF, 0x80, 0x7F) for keep in (0, 8, 16, 64)]
-    check([_filled(seed, keep, value) for seed in seeds for keep, value in shapes], target.run)
-
-
-def _filled(seed: bytes, keep: int, value: int) -> bytes:
-    """Packets whose bytes from `keep` on have one value; calibrations stay."""
-    parts = [
-        part
-        if part.kind == packets.CALIBRATION
-        else replace(part, data=part.data[:keep] + bytes([value]) * max(len(part.data) - keep, 0))
-        for part in parts_of(seed)
-    ]
-    return joined(parts)
 
 
 def test_a_capture_of_very_many_kinds_takes_seconds() -> None:

@@ -15,19 +15,15 @@ import pytest
 from mcap.reader import make_reader
 
 from mlbatch.rig.rig import read_rig
-from mlbatch.simulate.ouster.encode import metadata_json
-from tests.builders.bags import Recorded, imu_message
 from tests.builders.mcaps import write_mcap
 from tests.builders.rosbag1 import write_rosbag1
 from tests.builders.rosbag2 import Form, write_folder, write_rosbag2
 from tests.builders.run import TWO_LIDARS, Told, command, load, scan_files
 from tests.builders.sessions import NS_PER_MS, NS_PER_S, SMALL, Unit, twin
 from tests.builders.sessions_of_bags import (
-    description,
     session_of,
     split_at,
     unit_messages,
-    urdf,
 )
 from tests.builders.two_lidars import LEFT, RIGHT, body_from_sensor
 
@@ -139,19 +135,6 @@ def test_split_files_may_be_given_one_by_one(plain: Made, tmp_path: Path) -> Non
     assert convert(tmp_path / "scans", *reversed(parts)).files == plain.files
 
 
-@pytest.mark.parametrize(("x_m", "warns"), [(0.3, False), (0.3009, False), (0.35, True)])
-def test_a_contradicting_urdf_is_told(x_m: float, warns: bool, plain: Made, tmp_path: Path) -> None:
-    messages = session_of()
-    messages.insert(0, description(urdf(x_m), messages[0].log_ns))
-    made = convert(tmp_path / "scans", write_mcap(tmp_path / "drive.mcap", messages), "-v")
-    assert "extrinsics from tf_static: base_link -> left/os_sensor\n" in made.told.out
-    assert made.warnings == ([("extrinsics_contradict", "left")] if warns else [])
-    if warns:
-        assert "differ by 50.0 mm and 0.00 degrees" in made.told.err
-    # The transforms win.
-    assert made.files == plain.files
-
-
 def test_packets_in_a_capture_and_the_rest_in_a_bag(plain: Made, tmp_path: Path) -> None:
     shutil.copy(TWO_LIDARS / "two_lidars.pcap", tmp_path / "drive.pcap")
     others = [one for one in session_of() if "packets" not in one.topic]
@@ -182,25 +165,6 @@ def test_imu_messages_are_written_at_their_own_stamps(mcap: Path, tmp_path: Path
     assert imu_of(tmp_path / "scans.mcap") == [(one.log_ns, one.data) for one in sent]
 
 
-UPTIME = Unit(begin_ns=1000 * NS_PER_S, host_ns=1_700_000_000 * NS_PER_S)
-
-
-def test_imu_messages_on_another_clock_are_dropped_with_one_warning(tmp_path: Path) -> None:
-    messages = unit_messages(UPTIME, "roof")
-    for one in messages[1::8]:
-        data = imu_message("cdr", one.log_ns, "imu", 9.8)
-        messages.append(Recorded("/imu/data", "sensor_msgs/Imu", one.log_ns, data))
-    messages.sort(key=lambda one: one.log_ns)
-    bag = write_mcap(tmp_path / "drive.mcap", messages)
-    done = command("convert", bag, "-o", tmp_path / "scans.mcap")
-    assert done.code == 0
-    assert done.err == (
-        "mlbatch: warning: imu_clock: /imu/data: 12 message(s) dropped: their clock differs from "
-        "that of the scans\n"
-    )
-    assert imu_of(tmp_path / "scans.mcap") == []
-
-
 def test_arrival_times_of_single_packets_are_their_log_times(tmp_path: Path) -> None:
     unit = replace(Unit(), host_ns=3 * NS_PER_S)
     bag = write_rosbag2(tmp_path / "drive.db3", unit_messages(unit, "roof"))
@@ -211,20 +175,6 @@ def test_arrival_times_of_single_packets_are_their_log_times(tmp_path: Path) -> 
     assert set(arrivals) <= set(stamps.tolist())
     assert stamps.max() == arrivals[-1]
     assert stamps.min() > arrivals[0] - 4 * NS_PER_MS
-
-
-def test_inspect_of_a_folder_names_all_that_it_knows(tmp_path: Path) -> None:
-    bag = SESSIONS["split db3"](tmp_path)
-    done = command("inspect", bag, "--json")
-    assert (done.code, done.err) == (0, "")
-    found = json.loads(done.out)
-    lidars = {one["sensor"]: one for one in found["streams"] if one["serial"]}
-    for lidar in (LEFT, RIGHT):
-        one = lidars[lidar.name]
-        assert (one["packets"], one["lost"], one["serial"]) == (271, 0, lidar.serial)
-        assert one["extrinsics"] == f"tf_static: base_link -> {lidar.name}/os_sensor"
-        assert one["missing"] == ""
-    assert found["notes"] == []
 
 
 @pytest.mark.parametrize("name", ["MCAP", "split db3", "ROS 1"])
@@ -254,13 +204,6 @@ def test_packets_without_serial_number_go_by_their_topics(tmp_path: Path) -> Non
     scan = load(scan_files(made.folder)[0])
     for lidar_id, range_m in enumerate((4.0, 6.0)):
         assert set(scan["range_m"][scan["lidar_id"] == lidar_id].tolist()) == {range_m}
-
-
-def test_metadata_of_strangers_beside_a_bag_do_no_harm(plain: Made, tmp_path: Path) -> None:
-    bag = SESSIONS["MCAP"](tmp_path)
-    stranger = metadata_json(replace(SMALL, serial=999))
-    (tmp_path / "stranger.json").write_text(json.dumps(stranger), encoding="utf-8")
-    assert convert(tmp_path / "scans", bag).files == plain.files
 
 
 def test_passed_topics_keep_their_bytes(mcap: Path, tmp_path: Path) -> None:

@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-import gzip
 import re
 from collections import Counter
-from collections.abc import Callable
 from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
 
 import pytest
-import zstandard
 
 from mlbatch.discovery.discover import SensorSelection
 from mlbatch.frames.naming import NAMINGS
@@ -19,18 +16,8 @@ from mlbatch.pipeline.job import Job
 from mlbatch.readers import open_recording
 from mlbatch.ros.packet_types import PACKET_TYPES
 from mlbatch.types import StreamTable
-from tests.builders.captures import (
-    SLL2,
-    Interface,
-    Packet,
-    Section,
-    pcap_bytes,
-    section_bytes,
-    write_pcapng,
-)
-from tests.builders.run import FIXTURE, RECORDINGS, ROOT, Values, in_memory, prints
-from tests.builders.sessions_of_bags import CONTAINERS, edited_copy
-from tests.builders.traffic import datagrams_of, read_pcap
+from tests.builders.run import RECORDINGS, ROOT, in_memory
+from tests.builders.sessions_of_bags import edited_copy
 from tests.matrix.cells import plain
 from tests.matrix.containers import CONTAINERS as MATRIX
 from tests.matrix.lidars import write_metadata
@@ -50,76 +37,6 @@ BAGS = {
         1206,
     ),
 }
-
-
-@pytest.fixture(scope="module")
-def of_the_pcap() -> list[Values]:
-    """What the fixture gives."""
-    return prints(in_memory(FIXTURE))
-
-
-def _pcapng(tsresol: int, *, big_endian: bool = False) -> bytes:
-    """Stamps in units of 10 to the power of minus `tsresol` s."""
-    unit_ns = 10 ** (9 - tsresol)
-    blocks = [Packet(frame, host_ns // unit_ns) for host_ns, frame in FRAMES]
-    return section_bytes(Section(blocks, [Interface(tsresol=tsresol)], big_endian))
-
-
-FRAMES = read_pcap(FIXTURE.recordings[0])
-CAPTURES: dict[str, Callable[[], bytes]] = {
-    "pcap ns": lambda: pcap_bytes(FRAMES),
-    "pcap us big endian": lambda: pcap_bytes(FRAMES, ns=False, big_endian=True),
-    "pcap ns big endian": lambda: pcap_bytes(FRAMES, big_endian=True),
-    "pcapng us big endian": lambda: _pcapng(6, big_endian=True),
-    "gzip": lambda: gzip.compress(pcap_bytes(FRAMES), 1),
-    "zstd": lambda: zstandard.compress(_pcapng(9)),
-    "unfragmented": lambda: pcap_bytes([one.frame() for one in datagrams_of(FRAMES)]),
-    "cooked link": lambda: pcap_bytes(
-        [one.frame(SLL2) for one in datagrams_of(FRAMES)], linktype=SLL2
-    ),
-}
-
-
-@pytest.mark.parametrize("name", [*CONTAINERS, *CAPTURES])
-def test_scans_do_not_depend_on_the_container(
-    name: str, of_the_pcap: list[Values], tmp_path: Path
-) -> None:
-    if name in CONTAINERS:
-        path = CONTAINERS[name](tmp_path)
-    else:
-        path = tmp_path / "recording"
-        path.write_bytes(CAPTURES[name]())
-    assert prints(in_memory(replace(FIXTURE, recordings=(path,)))) == of_the_pcap
-
-
-@pytest.mark.parametrize("kind", ["pcap", "pcapng", "gz"])
-@pytest.mark.parametrize("order", ["as recorded", "last first"])
-def test_scans_do_not_depend_on_the_rotation_of_a_capture(
-    kind: str, order: str, of_the_pcap: list[Values], tmp_path: Path
-) -> None:
-    """As tcpdump -C writes it: nine of its borders are within a datagram."""
-    paths = rotated(FIXTURE.recordings[0], tmp_path, kind)
-    job = replace(FIXTURE, recordings=paths if order == "as recorded" else paths[::-1])
-    of_the_files = in_memory(job)
-    assert prints(of_the_files) == of_the_pcap
-    # SOURCE.md: 2074 frames, 714 datagrams.
-    skipped = of_the_files.report.capture.skipped
-    assert skipped == {"not_ip": 3, "not_udp": 2, "fragment": 1355}
-
-
-def rotated(path: Path, folder: Path, kind: str) -> tuple[Path, ...]:
-    """The frames of a capture in files of 180."""
-    records = read_pcap(path)
-    paths = []
-    for number, part in enumerate(records[at : at + 180] for at in range(0, len(records), 180)):
-        target = folder / f"trace.pcap{number or ''}"
-        if kind == "pcapng":
-            write_pcapng(target, [Section([Packet(frame, host_ns) for host_ns, frame in part])])
-        else:
-            data = pcap_bytes(part)
-            target.write_bytes(gzip.compress(data) if kind == "gz" else data)
-        paths.append(target)
-    return tuple(paths)
 
 
 @pytest.mark.parametrize(("name", "codes"), [("pcap", []), ("rosbag2", ["max_wait", "max_wait"])])

@@ -6,11 +6,6 @@ Recordings are those of `tests.resume_storm`: two lidars with an IMU, a bag, a c
 from __future__ import annotations
 
 import faulthandler
-import os
-import re
-import signal
-import subprocess
-import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -22,8 +17,7 @@ from mlbatch.errors import ExportError, PacketError
 from mlbatch.writers import output_file
 from mlbatch.writers.mcap_container import Chunk
 from tests.builders.run import command
-from tests.builders.sessions import REPOSITORY
-from tests.resume_storm import CASES, contents, write_recordings
+from tests.resume_storm import CASES, write_recordings
 
 _HANGS_AFTER_S = 300
 _TURNS = 14
@@ -134,49 +128,3 @@ def test_the_earliest_failed_scan_is_reported(
     for jobs in JOBS:
         outcome = command(*_words("npz", "--jobs", str(jobs), "--overwrite"))
         assert outcome.err.splitlines()[-1] == "mlbatch: error: scan 1"
-
-
-SLOW = """
-import sys, time
-from mlbatch import cli
-from mlbatch.writers.formats import npz
-encode = npz.NpzEncoder.encode
-def slow(*given):
-    time.sleep(0.2)
-    return encode(*given)
-npz.NpzEncoder.encode = slow
-cli.main()
-"""
-
-
-@pytest.mark.parametrize("jobs", JOBS)
-def test_an_interrupted_run_is_resumed(
-    recordings: Path, jobs: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    whole = _place(recordings, f"interrupt {jobs} whole")
-    monkeypatch.chdir(whole)
-    assert command(*_words("npz")).code == 0
-    place = _place(recordings, f"interrupt {jobs}")
-    words = _words("npz", "--jobs", str(jobs))
-    with subprocess.Popen(
-        [sys.executable, "-c", SLOW, *words],
-        cwd=place,
-        env=os.environ | {"PYTHONPATH": str(REPOSITORY)},
-        stderr=subprocess.PIPE,
-        text=True,
-    ) as process:
-        while not (place / "out.partial" / "000001.npz").exists():
-            assert process.poll() is None
-            time.sleep(0.02)
-        process.send_signal(signal.SIGINT)
-        _, said = process.communicate(timeout=300)
-    assert process.returncode == 130, said
-    assert said.endswith(
-        "mlbatch: error: interrupted; finished scans are kept in .partial, from where "
-        "--resume continues\n"
-    )
-    assert said.count("\n") == 1
-    monkeypatch.chdir(place)
-    outcome = command(*words, "--resume")
-    assert re.search(r"resumed after \d+ scans", outcome.err)
-    assert contents(place) == contents(whole)

@@ -23,8 +23,6 @@ from tests.builders.every_model import (
     velodyne_sent,
 )
 from tests.builders.lidar_packets import firing_ns
-from tests.builders.points import STAMP_NS, VELODYNE, cloud_message, write_points
-from tests.builders.rosbag2 import write_rosbag2
 from tests.builders.run import ROOT, command
 from tests.golden.test_bag_sessions import SESSIONS
 
@@ -92,24 +90,3 @@ def test_recorded_messages_are_counted(tmp_path: Path) -> None:
         checked = {check.name: check.checked for check in verdict.checks}
         assert checked["messages"] > 0
         assert checked["imu"] > 0
-
-
-def test_clouds_are_clean(tmp_path: Path) -> None:
-    """Points of a driver come twice where a shot had one return; both returns have one stamp."""
-    firings = [
-        (1 + column / 50, ring, 1, 9, ring, column * 5e-4)
-        for column in range(180)
-        for ring in range(16)
-        for _ in range(2)
-    ]
-    messages = [
-        cloud_message(VELODYNE, firings, STAMP_NS + number * 100_000_000) for number in range(4)
-    ]
-    bag = write_rosbag2(tmp_path / "clouds.db3", write_points("/points_raw", messages))
-    for layout in ("dense", "organized"):
-        target = tmp_path / layout
-        run = command("convert", bag, "-o", target, "--keep-partial", "--layout", layout)
-        assert run.code == 0, run.err
-        verdict = verify(target)
-        assert verdict.ok, verdict.violations
-        assert verdict.points == 4 * len(firings)

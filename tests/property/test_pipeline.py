@@ -74,13 +74,6 @@ def wanted(tmp_path_factory: pytest.TempPathFactory) -> Wanted:
     )
 
 
-@pytest.mark.parametrize("size", BUFFERS)
-def test_buffer_size_does_not_matter(size: int, wanted: Wanted, tmp_path: Path) -> None:
-    path = tmp_path / "recording.pcap"
-    path.write_bytes(pcap_bytes(frames(LENGTH_NS)))
-    wanted.check([path], tmp_path, size)
-
-
 # -- several files and other orders ---------------------------------------------------------------
 
 
