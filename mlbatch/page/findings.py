@@ -13,6 +13,7 @@ from mlbatch.page.windows import Windows
 from mlbatch.page.words import MEANINGS
 from mlbatch.reports.ledger import SensorLedger
 from mlbatch.reports.report import RunReport
+from mlbatch.ros.point_packets import KINDS
 
 _NETWORK = (
     "check network, switch and capture buffers (tcpdump -B, net.core.rmem_max), and the speed of "
@@ -62,7 +63,7 @@ REMEDIES = {
     "host_step": "do not set the clock of the capture host during a recording",
     "max_wait": "give --max-wait in seconds",
     "cloud_time": "state unit or from of points, or the clock, in the rig, as the warning says",
-    "clouds": "nothing to do; check that the interpretation is correct",
+    "clouds": "mlbatch inspect measures whether the times fit the motion",
     "dataset": "check a few seconds of scans; the pages of each fact: mlbatch datasets --json",
 }
 _INFORMATION = frozenset({"clouds", "constant_tf", "dataset"})
@@ -118,8 +119,10 @@ def verdict(found: list[Finding], report: RunReport) -> tuple[Level, str, str]:
     level = max((one.level for one in found), default=Level.GOOD)
     if level < Level.WARNING:
         # Where lidars are, no packet says: the heading names what was compared.
-        poses = "poses not checked" if report.poses is None else report.poses.describe()
-        return Level.GOOD, f"{_FINE}; {poses}", ""
+        covered = "poses not checked" if report.poses is None else report.poses.describe()
+        if any(sensor.model in KINDS for sensor in report.sensors):
+            covered += "; times of points not measured"
+        return Level.GOOD, f"{_FINE}; {covered}", ""
     problems = sum(one.level == Level.PROBLEM for one in found)
     warnings = sum(one.level == Level.WARNING for one in found)
     parts = [number(problems, "problem")] * (problems > 0)

@@ -101,6 +101,10 @@ DRIFT_S = 10
 _USUAL_ERROR = 0.05
 
 
+# Of a reading of times that is plausible.
+_UNMEASURED = "whether they fit the motion was not measured, mlbatch inspect does"
+
+
 def _cloud_notes(run: Conversion) -> Iterator[Note]:
     """How the times of decoded clouds were read."""
     if not any(recording.topics for recording in run.session.recordings):
@@ -111,7 +115,7 @@ def _cloud_notes(run: Conversion) -> Iterator[Note]:
     for recording in run.session.recordings:
         if isinstance(recording, CloudRecording):
             for text in recording.verdicts:
-                yield Note(CLOUDS, "", f"{recording.path.name}: {text}")
+                yield Note(CLOUDS, "", f"{recording.path.name}: {text}; {_UNMEASURED}")
 
 
 def host_offsets(run: Conversion) -> list[HostOffset]:

@@ -38,6 +38,8 @@ def test_a_clean_run_has_no_finding() -> None:
         "Packets, windows and clocks are fine; poses not checked",
         "",
     )
+    document["sensors"][1]["model"] = "PointCloud2"
+    assert _verdict(document)[1].endswith("; poses not checked; times of points not measured")
 
 
 @pytest.mark.parametrize(

@@ -34,8 +34,8 @@ def verdict(reading: Reading, findings: Sequence[TimeFinding]) -> str:
     """Right, not decided or wrong."""
     right = next(one for one in findings if one.sensor == "right")
     keys = {name: value for one in findings for name, value in one.set.items()}
-    if "not decided" in (right.order, right.delay):
-        return "wrong" if keys else "not decided"
+    if not keys and any("not decided" in (one.order, one.delay) for one in findings):
+        return "not decided"
     named = _NAMED.get(reading.name)
     if named is None:
         return "wrong" if keys else "right"
