@@ -86,10 +86,11 @@ _ONE_JOB = {
     "ply": Case("session/drive.pcap", "out", (*TWO, "--format", "ply", "--min-range", "4.1")),
     "jumps": Case("jumps/drive.pcap", "out.mcap", ("--on-jump", "split", "--keep-partial")),
 }
-CASES = _ONE_JOB | {
+_THREE_JOBS = {
     f"{name} jobs": replace(case, options=(*case.options, "--jobs", "3"))
     for name, case in _ONE_JOB.items()
 }
+CASES = _ONE_JOB | _THREE_JOBS
 
 
 def write_recordings(folder: Path, turns: int) -> None:
@@ -375,7 +376,9 @@ def main() -> None:
     given = parser.parse_args()
     outputs = 0
     fault = ""
-    names = list(CASES)
+    # Alternately, so that a short storm has each of them by one job or by three.
+    pairs = list(zip(_ONE_JOB, _THREE_JOBS, strict=True))
+    names = [pair[(number + turn) % 2] for turn in (0, 1) for number, pair in enumerate(pairs)]
     with storm(given.seed, given.turns, given.again) as one:
         while sum(one.kills.values()) < given.count and not fault:
             fault = one.strike(names[outputs % len(names)])

@@ -216,20 +216,3 @@ def test_passed_topics_keep_their_bytes(mcap: Path, tmp_path: Path) -> None:
     assert found == sent
     (length,) = struct.unpack_from("<I", found[topics[0]], 4)
     assert json.loads(found[topics[0]][8 : 8 + length - 1])["sensor_info"]["prod_sn"] == LEFT.serial
-
-
-@pytest.mark.parametrize(
-    ("session", "output"),
-    [("MCAP", ("-o", "out.bag")), ("ROS 1", ("-o", "out", "--format", "rosbag2"))],
-)
-def test_messages_of_the_other_ros_are_dropped_with_a_warning(
-    session: str, output: tuple[str, ...], tmp_path: Path
-) -> None:
-    """The output stores the scans, but not messages of the other ROS version."""
-    bag = SESSIONS[session](tmp_path)
-    target = tmp_path / output[1]
-    outcome = command("convert", bag, output[0], target, *output[2:])
-    assert outcome.code == 0, outcome.err
-    (warning,) = [line for line in outcome.err.splitlines() if "other_ros" in line]
-    assert "message(s) dropped: the output cannot store its ROS version" in warning
-    assert f"{WHOLE_SCANS} scans" in outcome.out

@@ -15,7 +15,7 @@ from tests.builders.feeds import Case, feeds, groups, interleavings, random_feed
 from tests.reference.batching import FeedPacket, Outcome, Settings, reference_scans
 
 SEEDS_A_BLOCK = 250
-BLOCKS = range(20)
+BLOCKS = range(8)
 INTERLEAVED_BLOCKS = range(100, 104)
 
 

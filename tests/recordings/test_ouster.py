@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -11,7 +10,7 @@ import pytest
 
 from mlbatch.arrays import BoolArray, F32Array, I64Array
 from tests.builders.run import Cloud, command
-from tests.recordings.ouster import CASES, OUSTER, PAIRS, SINGLES, Case, twins
+from tests.recordings.ouster import CASES, OUSTER, PAIRS, Case, twins
 
 TOLERANCE_M = 1e-4
 
@@ -82,20 +81,6 @@ def test_every_pixel_of_a_sensor_alone(case: Case, tmp_path: Path) -> None:
     assert np.array_equal(found.stamp_ns, expected.stamp_ns)
     assert np.array_equal(found.at_ns, expected.stamp_ns)
     compare(found, expected)
-
-
-@pytest.mark.parametrize("case", SINGLES, ids=str)
-def test_metadata_next_to_the_recording_is_found(case: Case, tmp_path: Path) -> None:
-    explicit = command(*convert(case), "--dry-run", "--keep-partial", "--quiet")
-    found = command("convert", case.path, "--dry-run", "--keep-partial")
-    assert found.code == 0, found.err
-    assert _without_timing(found.out) == _without_timing(explicit.out)
-
-
-def _without_timing(text: str) -> dict[str, object]:
-    report: dict[str, object] = json.loads(text)
-    del report["timing"], report["command"]
-    return report
 
 
 @pytest.mark.parametrize("pair", PAIRS, ids=lambda pair: pair[0].folder)

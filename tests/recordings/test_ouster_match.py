@@ -73,21 +73,6 @@ def calibration_at(path: Path) -> OusterCalibration:
     return found
 
 
-@pytest.mark.parametrize(
-    ("kind", "sizes"), [("legacy", (24896, 12608)), ("nonlegacy", (16640,) * 2)]
-)
-def test_two_sensors_on_the_same_ports(kind: str, sizes: tuple[int, int]) -> None:
-    folder = OUSTER / f"two-sensors_same-ports_{kind}"
-    for number, size in zip(SOURCES, sizes, strict=True):
-        found = evidence(folder / f"same_ports_{kind}.pcap", size, SOURCES[number])
-        fits = {
-            other: calibration_at(folder / f"same_ports_{kind}.{other}.json").match_score(found)
-            for other in SOURCES
-        }
-        assert fits[number] > 0
-        assert [other for other in SOURCES if fits[other]] == [number]
-
-
 def test_of_two_configurations_of_one_unit_the_one_whose_imu_was_seen_wins() -> None:
     found = evidence(SAME / "same_ports_nonlegacy.pcap", 16640, SOURCES[2])
     assert (7502, 48) in {(one.stream.port, one.size) for one in found.neighbours}

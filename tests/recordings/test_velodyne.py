@@ -36,9 +36,8 @@ every_case = pytest.mark.parametrize("case", CASES, ids=lambda case: case.folder
 
 
 @every_case
-@pytest.mark.parametrize("rate", ["10", "7.5", "100/3"])
-def test_every_point_with_the_angles_of_the_vendor(case: Case, rate: str, tmp_path: Path) -> None:
-    ours = converted(case.alone(tmp_path), tmp_path / "out", "--rate", rate).cloud
+def test_every_point_with_the_angles_of_the_vendor(case: Case, tmp_path: Path) -> None:
+    ours = converted(case.alone(tmp_path), tmp_path / "out").cloud
     check(case, ours, added_m=0 * case.heights_m)
 
 
