@@ -7,7 +7,7 @@ two lidars are apart before and after, and which poses these places alone would 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 
@@ -29,6 +29,7 @@ from mlbatch.poses.solve import (
     Solution,
     State,
     better_start,
+    estimate,
     find_poses,
     moved,
     solve,
@@ -627,18 +628,33 @@ def _refuse_unseen(found: Solution, names: Sequence[str]) -> None:
 
 def _refuse_late(problem: Problem, found: Solution, names: Sequence[str]) -> None:
     """Refuse poses that make up for timestamps that are late."""
+    seems = estimate(problem, problem.rows(found.state, LEVELS[-1]), found.state)
+    # One match may be too short.
+    if not any(late for *_, late in _delays(seems, names, 0.5)):
+        return
     late = solve(problem, found.state, LEVELS[-1])
-    sigma_s = np.sqrt(np.diag(late.covariance))[6::7]
-    for name, delay, sigma in zip(
-        names[1:], late.state.delay_s[1:].tolist(), sigma_s.tolist(), strict=True
-    ):
-        if sigma < _MOST_DELAY_SIGMA_S and abs(delay) > max(_LEAST_DELAY_S, 5.0 * sigma):
+    for name, delay, sigma, is_late in _delays(late, names):
+        if is_late:
             raise _refused(
                 f"timestamps of {name} that agree with those of {names[0]}",
                 f"a delay of {-MS_PER_S * delay:.1f} ms (+- {MS_PER_S * sigma:.1f}), which poses "
                 "without it would hide",
                 "give --time-offset",
             )
+
+
+def _delays(
+    found: Solution, names: Sequence[str], share: float = 1.0
+) -> Iterator[tuple[str, float, float, bool]]:
+    """Delay and standard deviation of each lidar but the first, s, and whether it is proven.
+
+    share: of what proves it.
+    """
+    sigma_s = np.sqrt(np.diag(found.covariance))[6::7]
+    delay_s = found.state.delay_s[1:]
+    for name, delay, sigma in zip(names[1:], delay_s.tolist(), sigma_s.tolist(), strict=True):
+        least_s = share * max(_LEAST_DELAY_S, 5.0 * sigma)
+        yield name, delay, sigma, sigma < _MOST_DELAY_SIGMA_S / share and abs(delay) > least_s
 
 
 def _refuse_undetermined(found: Solution, names: Sequence[str], *, delays: bool) -> None:

@@ -9,8 +9,9 @@ a small motion of its points in the body frame, after the pose that they were co
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from itertools import combinations, product
+from dataclasses import dataclass, replace
+from functools import cached_property
+from itertools import combinations
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -18,7 +19,7 @@ import numpy as np
 from mlbatch.arrays import F64Array, I64Array
 from mlbatch.motion.registration import ORIGIN, Pose
 from mlbatch.motion.se3 import exp_rotation, log_rotation, skew
-from mlbatch.poses.surfaces import Distances, Moments, Planes, distances
+from mlbatch.poses.surfaces import Distances, Moments, Planes, distances, joined
 from mlbatch.units import NS_PER_S
 
 if TYPE_CHECKING:
@@ -49,9 +50,16 @@ _STEP_M, _STEP_MPS = 0.2, 1.0
 _CALM = 3.0
 _LONGEST_M, _LONGEST_RAD = 0.5, 0.1
 _LONGEST_MPS, _LONGEST_RADPS = 5.0, 0.5
+# What the last term of a motion may be, as a share of a distance.
+_SERIES = 1e-6
+# Where surfaces are matched so far apart, steps of poses that follow each other within a cosine are
+# made longer, each by more.
+_FAR_M = 1.0
+_ALONG = 0.9
+_LONGER, _MOST_LONGER = 1.5, 4.0
 # A step that changes poses and twists by less ends the search.
 _SMALL_M, _SMALL_RAD = 1e-4, 1e-5
-_SMALL_MPS, _SMALL_RADPS = 5e-3, 5e-4
+_SMALL_MPS, _SMALL_RADPS = 0.04, 0.006
 
 
 @dataclass(eq=False, repr=False)
@@ -79,6 +87,16 @@ class Cloud:
     def span_s(self) -> float:
         """From its first to its last point."""
         return float(np.ptp(self.time_s))
+
+    @cached_property
+    def stems(self) -> Stems | None:
+        """Its stems; None without an origin."""
+        if self.origin_m is None:
+            return None
+        # Not loaded by checks of poses that need none.
+        from mlbatch.poses.stems import stems
+
+        return stems(self.points_m, self.time_s, self.origin_m)
 
 
 # Clouds of windows that follow each other.
@@ -128,10 +146,13 @@ _SEARCH = (
     Level(0.5, 0.94, 0.4, 40_000, 1),
     Level(0.25, 0.97, 0.15, 60_000, 3),
 )
+# Steps of all places before the last level, which need not settle.
+_MIDDLE_STEPS = 6
 # Of a search that ended badly: turns about z that others begin with; places that these look at;
-# surfaces that agree; how many more of them make a start better.
-_TURNS_RAD = np.deg2rad([-20.0, -10.0, 10.0, 20.0])
+# steps of each before the best is chosen; surfaces that agree; how many more make a start better.
+_TURNS_RAD = np.deg2rad([-20.0, -10.0, 0.0, 10.0, 20.0])
 _MOST_TRIED = 4
+_TRIAL_STEPS = 5
 _AGREES = Level(1.0, 0.94, 0.1)
 _MORE = 1.05
 
@@ -203,7 +224,6 @@ class Problem:
         self.each = 7 if delays else 6
         self.poses = self.each * (lidars - 1)
         self._known = known
-        self._stems: dict[tuple[int, int], Stems] = {}
 
     def known(self, state: State) -> tuple[F64Array, F64Array]:
         """Information (poses, poses) that is known before, and its slope (poses,) at a state."""
@@ -227,7 +247,9 @@ class Problem:
             # An odd step takes all beams in turn.
             step = -(-len(cloud.points_m) // level.points) | 1
             time_s = cloud.time_s[::step] + state.delay_s[cloud.lidar]
-            points_m = _corrected(cloud.points_m[::step], state.corrections[cloud.lidar])
+            # What follows is faster column by column.
+            points_m = np.asfortranarray(cloud.points_m[::step])
+            points_m = _corrected(points_m, state.corrections[cloud.lidar])
             points_m = moved(points_m, time_s, state.twists[place])
             sizes = [Moments.of_points(points_m, time_s, level.edge_m)]
             for _ in range(level.doubled):
@@ -237,23 +259,16 @@ class Problem:
 
     def stems(self, place: int, state: State) -> list[Stems | None]:
         """Stems of the clouds of a place, moved to its instant."""
-        if all(cloud.origin_m is None for cloud in self.places[place]):
-            return [None] * len(self.places[place])
-        # Not loaded by checks of poses that need none.
-        from mlbatch.poses.stems import Stems, stems
-
         found: list[Stems | None] = []
-        for number, cloud in enumerate(self.places[place]):
-            if cloud.origin_m is None:
+        for cloud in self.places[place]:
+            seen, pose = cloud.stems, state.corrections[cloud.lidar]
+            if seen is None:
                 found.append(None)
                 continue
-            if (place, number) not in self._stems:
-                self._stems[place, number] = stems(cloud.points_m, cloud.time_s, cloud.origin_m)
-            seen, pose = self._stems[place, number], state.corrections[cloud.lidar]
             time_s = seen.time_s + state.delay_s[cloud.lidar]
             axis_m = moved(_corrected(seen.axis_m, pose), time_s, state.twists[place])
             along = np.matmul(pose.rotation, seen.along)
-            found.append(Stems(axis_m, along, seen.radius_m, seen.sigma_m, time_s))
+            found.append(replace(seen, axis_m=axis_m, along=along, time_s=time_s))
         return found
 
     def rows(self, state: State, level: Level) -> list[Rows]:
@@ -269,32 +284,24 @@ class Problem:
         """The equations of a place with its planes."""
         place = self.places[number]
         uprights = self.stems(number, state)
-        parts = []
+        parts, pairs = [], []
         for first, second in combinations(range(len(place)), 2):
-            pair = place[first].lidar, place[second].lidar
-            for sizes in zip(surfaces[first], surfaces[second], strict=True):
-                found = distances(*sizes, level.parallel, level.most_m)
-                parts.append(self._rows(pair, found, state.twists[number]))
+            found = [
+                distances(*sizes, level.parallel, level.most_m)
+                for sizes in zip(surfaces[first], surfaces[second], strict=True)
+            ]
             one, other = uprights[first], uprights[second]
             if one is not None and other is not None:
                 from mlbatch.poses.stems import stem_distances
 
-                axes = stem_distances(one, other, level.parallel, level.most_m)
-                if axes is not None:
-                    parts.append(self._rows(pair, axes, state.twists[number]))
-        if not parts:
-            empty = np.zeros((0, self.poses + 6))
-            none = np.zeros(0, np.int64)
-            return Rows(empty, empty, np.zeros(0), none, none.reshape(0, 2))
-        return Rows(
-            np.concatenate([part.jacobian for part in parts]),
-            np.concatenate([part.noise for part in parts]),
-            np.concatenate([part.residual for part in parts]),
-            np.concatenate([part.block for part in parts]),
-            np.concatenate([part.pair for part in parts]),
-        )
+                found.append(stem_distances(one, other, level.parallel, level.most_m))
+            parts += found
+            pairs += [(place[first].lidar, place[second].lidar)] * sum(map(len, found))
+        pair = np.array(pairs, np.int64).reshape(-1, 2)
+        return self._rows(pair, joined(parts), state.twists[number])
 
-    def _rows(self, pair: tuple[int, int], found: Distances, twist: F64Array) -> Rows:
+    def _rows(self, pair: I64Array, found: Distances, twist: F64Array) -> Rows:
+        """Equations of distances between the clouds of lidars (m, 2)."""
         weight = 1.0 / found.sigma_m[:, None]
         sector = np.arctan2(found.at_m[:, 1], found.at_m[:, 0]) * (_SECTORS / (2 * np.pi))
         ring = np.log(np.hypot(found.at_m[:, 0], found.at_m[:, 1]) + 1.0) / np.log(_RING)
@@ -303,20 +310,20 @@ class Problem:
             self._jacobian(pair, found, found.tilt, twist) * weight,
             found.distance_m / found.sigma_m,
             np.floor(sector).astype(np.int64) * 100 + np.floor(ring).astype(np.int64),
-            np.tile(np.array(pair), (len(found), 1)),
+            pair,
         )
 
     def _jacobian(
-        self, pair: tuple[int, int], found: Distances, normal: F64Array, twist: F64Array
+        self, pair: I64Array, found: Distances, normal: F64Array, twist: F64Array
     ) -> F64Array:
         jacobian = np.zeros((len(found), self.poses + 6))
         lever = np.concatenate([normal, np.cross(found.at_m, normal)], axis=1)
-        for lidar, sign in zip(pair, (-1.0, 1.0), strict=True):
-            if lidar:
-                at = self.each * (lidar - 1)
-                jacobian[:, at : at + 6] += sign * lever
-                if self.each == 7:
-                    jacobian[:, at + 6] += sign * np.matmul(lever, twist)
+        for lidar in range(1, self.lidars):
+            at = self.each * (lidar - 1)
+            sign = (pair == lidar) @ [-1.0, 1.0]
+            jacobian[:, at : at + 6] = sign[:, None] * lever
+            if self.each == 7:
+                jacobian[:, at + 6] = sign * np.matmul(lever, twist)
         apart_s = found.time_s[:, 1] - found.time_s[:, 0]
         jacobian[:, self.poses :] = lever * apart_s[:, None]
         return jacobian
@@ -325,24 +332,32 @@ class Problem:
 def _corrected(points_m: F64Array, pose: Pose) -> F64Array:
     if pose is ORIGIN:
         return points_m
-    found: F64Array = np.matmul(points_m, pose.rotation.T) + pose.position_m
-    return found
+    found: F64Array = np.matmul(pose.rotation, points_m.T)
+    found += pose.position_m[:, None]
+    columns: F64Array = found.T
+    return columns
 
 
 def moved(points_m: F64Array, time_s: F64Array, twist: F64Array) -> F64Array:
     """Points (n, 3) moved by a constant twist (6,) over their times (n,)."""
     if not twist.any() or not len(points_m):
         return points_m
-    turn = skew(twist[None, 3:])[0].T
-    term = np.matmul(points_m, turn) + twist[:3]
-    term *= time_s[:, None]
-    found: F64Array = points_m + term
+    turn = skew(twist[None, 3:])[0]
+    speed = np.matmul(turn, points_m.T) + twist[:3, None]
     # The exponential as its series: turns of 0.3 rad leave 1e-6 of a distance.
-    for order in range(2, 6):
-        term = np.matmul(term, turn)
-        term *= time_s[:, None] / order
-        found += term
-    return found
+    most = float(np.abs(time_s).max()) * float(np.linalg.norm(twist[3:]))
+    terms = next(n for n in range(1, 6) if n == 5 or most ** (n + 1) < _SERIES)
+    term = [speed]
+    for order in range(2, terms + 1):
+        term.append(np.matmul(turn / order, term[-1]))
+    found = term.pop()
+    found *= time_s
+    for lower in reversed(term):
+        found += lower
+        found *= time_s
+    found += points_m.T
+    columns: F64Array = found.T
+    return columns
 
 
 class Solution(NamedTuple):
@@ -366,10 +381,23 @@ def solve(problem: Problem, state: State, level: Level, most_steps: int = 25) ->
     """Damped Gauss-Newton from a state, with surfaces matched anew in each step."""
     converged = False
     equations = _Equations(problem, problem.rows(state, level), state)
+    before, longer = np.zeros(problem.poses), 1.0
     for _ in range(most_steps):
         step = equations.step()
+        # Surfaces that come into reach one after the other draw lidars on by short equal steps.
+        poses = step[: problem.poses] / equations.units
+        size = float(np.linalg.norm(poses) * np.linalg.norm(before))
+        is_along = level.most_m >= _FAR_M and poses @ before > _ALONG * size
+        longer = min(_LONGER * longer, _MOST_LONGER) if is_along else 1.0
+        before = poses
+        step[: problem.poses] *= longer
         state = _after(problem, state, step)
         equations = _Equations(problem, problem.rows(state, level), state)
+        if level.most_m <= FINE.most_m:
+            # What nothing fixes has no end.
+            _, weak = equations.determined()
+            poses -= np.matmul(weak, np.matmul(weak.T, poses))
+            step[: problem.poses] = poses * equations.units
         if _is_small(problem, step, max(1.0, level.most_m / FINE.most_m) ** 2):
             converged = True
             break
@@ -417,13 +445,18 @@ def find_poses(
     """
     state = guess or State.start(lidars, len(places))
     problem = Problem(places, lidars, known=known)
-    afar, *coarse, fine = _SEARCH
+    afar, *_, fine = _SEARCH
+    # A few places say where lidars are, about.
+    step = -(-len(places) // _MOST_TRIED)
+    few = Problem(places[::step], lidars, known=known)
+    near = State(state.corrections, state.twists[::step], state.delay_s)
     for _ in range(_MOST_VOTES):
-        state = solve(problem, state, afar).state
-        if not _follow_votes(problem, state):
+        near = solve(few, near, afar).state
+        if not _follow_votes(few, near):
             break
-    for level in coarse:
-        state = solve(problem, state, level).state
+    state = State(near.corrections, state.twists, near.delay_s)
+    for level in _SEARCH[step == 1 : -1]:
+        state = solve(problem, state, level, _MIDDLE_STEPS).state
     return solve(Problem(places, lidars, delays=delays, known=known), state, fine)
 
 
@@ -436,13 +469,18 @@ def better_start(places: Sequence[Place], end: State) -> State | None:
     problem = Problem(places[::step], len(end.corrections))
     best = State(end.corrections, end.twists[::step], end.delay_s)
     first = most = _agreeing(problem, best)
-    turns = [(0.0, 1), *product(_TURNS_RAD.tolist(), range(1, problem.lidars))]
-    for turn_rad, lidar in turns:
-        rotation = exp_rotation(np.array([[0.0, 0.0, turn_rad]]))[0]
-        corrections = list(best.corrections)
-        corrections[lidar] = after_move(corrections[lidar], Pose(rotation, np.zeros(3)))
-        start = State(corrections, best.twists, best.delay_s)
-        state = solve(problem, start, _SEARCH[0]).state
+    for lidar in range(1, problem.lidars):
+        tried = []
+        for turn_rad in _TURNS_RAD.tolist():
+            rotation = exp_rotation(np.array([[0.0, 0.0, turn_rad]]))[0]
+            corrections = list(best.corrections)
+            corrections[lidar] = after_move(corrections[lidar], Pose(rotation, np.zeros(3)))
+            start = State(corrections, best.twists, best.delay_s)
+            state = solve(problem, start, _SEARCH[0], _TRIAL_STEPS).state
+            tried.append((_agreeing(problem, state), -abs(turn_rad), state))
+        # Only the most promising one is worth a whole search.
+        *_, state = max(tried, key=lambda one: one[:2])
+        state = solve(problem, state, _SEARCH[0]).state
         agreeing = _agreeing(problem, state)
         if agreeing > most:
             best, most = state, agreeing
@@ -490,8 +528,8 @@ def _is_small(problem: Problem, step: F64Array, factor: float) -> bool:
     six = np.abs(step[: problem.poses].reshape(-1, problem.each))
     twists = np.abs(step[problem.poses :].reshape(-1, 6))
     small = (six[:, :3] < factor * _SMALL_M).all() and (six[:, 3:6] < factor * _SMALL_RAD).all()
-    small &= (twists[:, :3] < factor * _SMALL_MPS).all()
-    small &= (twists[:, 3:] < factor * _SMALL_RADPS).all()
+    small &= (twists[:, :3] < np.sqrt(factor) * _SMALL_MPS).all()
+    small &= (twists[:, 3:] < np.sqrt(factor) * _SMALL_RADPS).all()
     return bool(small)
 
 
@@ -527,10 +565,10 @@ class _Equations:
         self._twists = state.twists
         self._information, self._slope = problem.known(state)
         self._prior = np.array([_SPEED_MPS**-2.0] * 3 + [_TURN_RADPS**-2.0] * 3)
-        self._units = np.ones(problem.poses)
+        self.units = np.ones(problem.poses)
         for lidar in range(problem.lidars - 1):
             at = problem.each * lidar
-            self._units[at + 3 : at + 6] = 1.0 / _LEVER_M
+            self.units[at + 3 : at + 6] = 1.0 / _LEVER_M
         self._residual = [part.residual / part.scale for part in rows]
         # Share of each residual in the kernel.
         self._off = [(residual / KERNEL) ** 2 for residual in self._residual]
@@ -543,7 +581,7 @@ class _Equations:
     def step(self) -> F64Array:
         """Change of all unknowns."""
         size = self.problem.poses
-        damped = _STEP_M**-2.0 / self._units**2
+        damped = _STEP_M**-2.0 / self.units**2
         normal, gradient = np.diag(damped) + self._information, self._slope.copy()
         lever = np.array([1.0] * 3 + [_LEVER_M] * 3)
         kept = []
@@ -587,7 +625,7 @@ class _Equations:
         most_m = most_sigma_m or _MOST_SIGMA_M
         if not size:
             return np.zeros((0, 0)), np.zeros((0, 0))
-        known_before = self._information * self._units * self._units[:, None]
+        known_before = self._information * self.units * self.units[:, None]
         plain, true = known_before.copy(), known_before.copy()
         scores, levers, noises, blocks = [], [], [], []
         for part, residual, off in zip(self._rows, self._residual, self._off, strict=True):
@@ -600,7 +638,7 @@ class _Equations:
             ratio = np.linalg.solve(twist, weighted[size:, :size])
             pose = jacobian[:, :size] - np.matmul(jacobian[:, size:], ratio)
             wrong = noise[:, :size] - np.matmul(noise[:, size:], ratio)
-            pose, wrong = pose * self._units, wrong * self._units
+            pose, wrong = pose * self.units, wrong * self.units
             plain += _product(pose, slope)
             true += _product(pose, slope) - _product(wrong, slope)
             scores.append(pose * (residual / (1.0 + off))[:, None])
@@ -637,8 +675,8 @@ class _Equations:
         covariance[~seen] = 0.0
         covariance[:, ~seen] = 0.0
         covariance += np.diag(np.where(seen, 0.0, _UNKNOWN_M**2))
-        to_units = axes * self._units[:, None]
-        floor = np.where(self._units == 1.0, _FLOOR_M, _FLOOR_RAD)
+        to_units = axes * self.units[:, None]
+        floor = np.where(self.units == 1.0, _FLOOR_M, _FLOOR_RAD)
         found = np.matmul(np.matmul(to_units, covariance), to_units.T) + np.diag(floor**2)
         return found, axes[:, ~seen]
 

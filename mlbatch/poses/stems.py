@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from mlbatch.arrays import BoolArray, F64Array, I64Array
-from mlbatch.poses.surfaces import Distances
+from mlbatch.poses.surfaces import NO_DISTANCES, Distances
 
 # Points are grouped in layers, by neighbouring cells in a layer, m.
 _LAYER_M = 0.8
@@ -173,33 +173,31 @@ def _direction(mean: F64Array) -> F64Array | None:
     return found
 
 
-def stem_distances(first: Stems, second: Stems, parallel: float, most_m: float) -> Distances | None:
+def stem_distances(first: Stems, second: Stems, parallel: float, most_m: float) -> Distances:
     """Compare the axes of two clouds, each with the nearest of the other: two rows a pair.
 
     parallel: least cosine between the directions; most_m: largest distance.
     """
     if not len(first) or not len(second) or first.along @ second.along < parallel:
-        return None
+        return NO_DISTANCES
     along = first.along + second.along
     along /= np.linalg.norm(along)
     ways = np.linalg.svd(along[None])[2][1:]
     one, other = np.matmul(first.axis_m, ways.T), np.matmul(second.axis_m, ways.T)
-    high = (second.axis_m @ along)[None, :] - (first.axis_m @ along)[:, None]
-    far = (other[None, :, 0] - one[:, None, 0]) ** 2 + (other[None, :, 1] - one[:, None, 1]) ** 2
-    far[np.abs(high) > _MOST_ALONG_M] = np.inf
-    right = np.argmin(far, axis=1)
-    left = np.arange(len(first))
-    kept = (np.argmin(far, axis=0)[right] == left) & (far[left, right] < most_m**2)
-    left, right = left[kept], right[kept]
+    left, right = _within_reach(one[:, 0], other[:, 0], most_m)
+    high = (second.axis_m @ along)[right] - (first.axis_m @ along)[left]
+    far = (other[right, 0] - one[left, 0]) ** 2 + (other[right, 1] - one[left, 1]) ** 2
+    near = (np.abs(high) <= _MOST_ALONG_M) & (far < most_m**2)
+    left, right, high, far = left[near], right[near], high[near], far[near]
+    kept = _is_least(left, far) & _is_least(right, far)
+    left, right, high = left[kept], right[kept], high[kept]
     # A radius that differs says that they are two stems.
     ratio = first.radius_m[left] / second.radius_m[right]
     kept = (ratio > 0.5) & (ratio < 2.0)
-    left, right = left[kept], right[kept]
-    if not len(left):
-        return None
+    left, right, high = left[kept], right[kept], high[kept]
     middle_m = (first.axis_m[left] + second.axis_m[right]) / 2
     # Each along its own direction to the height of the middle.
-    half = high[left, right, None] / 2
+    half = high[:, None] / 2
     gap = second.axis_m[right] - first.axis_m[left] - half * (first.along + second.along)
     sigma_m = np.sqrt(first.sigma_m[left] ** 2 + second.sigma_m[right] ** 2)
     time_s = np.stack([first.time_s[left], second.time_s[right]], axis=1)
@@ -214,3 +212,21 @@ def stem_distances(first: Stems, second: Stems, parallel: float, most_m: float) 
         np.concatenate([time_s, time_s]),
         np.repeat([-(tilt @ way) * along for way in ways], number, axis=0),
     )
+
+
+def _within_reach(one: F64Array, other: F64Array, most: float) -> tuple[I64Array, I64Array]:
+    """Rows of both, in pairs, whose values (n,) and (m,) differ by most at most."""
+    order = np.argsort(other)
+    begin = np.searchsorted(other[order], one - most, side="left")
+    count = np.searchsorted(other[order], one + most, side="right") - begin
+    left = np.repeat(np.arange(len(one)), count)
+    within = np.arange(len(left)) - np.repeat(np.cumsum(count) - count, count)
+    return left, order[begin[left] + within]
+
+
+def _is_least(group: I64Array, value: F64Array) -> BoolArray:
+    """Mask (n,) of the least value of each group."""
+    order = np.lexsort((value, group))
+    found = np.zeros(len(group), np.bool_)
+    found[order] = np.diff(group[order], prepend=-1) != 0
+    return found

@@ -9,7 +9,7 @@ the points.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import NamedTuple
 
 import numpy as np
@@ -112,7 +112,10 @@ class Moments:
         means = self.total[enough] / count[:, None]
         mean = means[:, :3]
         square = means[:, [3, 4, 5, 4, 6, 7, 5, 7, 8]].reshape(-1, 3, 3)
-        variance, axes = np.linalg.eigh(square - mean[:, :, None] * mean[:, None, :])
+        square -= mean[:, :, None] * mean[:, None, :]
+        may_be = _may_be_flat(square, self.edge_m)
+        key, count, means, mean = key[may_be], count[may_be], means[may_be], mean[may_be]
+        variance, axes = np.linalg.eigh(square[may_be])
         variance = np.maximum(variance, 0.0)
         across, along, _ = variance.T
         is_plane = along >= (_LEAST_SPREAD * self.edge_m) ** 2
@@ -134,6 +137,18 @@ class Moments:
             noise + _FLOOR_M**2,
             np.matmul(tilt, tilt.transpose(0, 2, 1)),
         )
+
+
+def _may_be_flat(variance: F64Array, edge_m: float) -> BoolArray:
+    """Mask of variances (k, 3, 3), m2, that bounds do not say are no plane: cheaper than axes."""
+    xx, xy, xz, yy, yz, zz = variance.reshape(-1, 9)[:, [0, 1, 2, 4, 5, 8]].T
+    # Of principal variances a <= b <= c: ab + ac + bc >= bc >= bb, so that abc is at most a of it.
+    yy_zz, xy_zz, xy_yz = yy * zz - yz * yz, xy * zz - xz * yz, xy * yz - xz * yy
+    pairs = yy_zz + xx * zz - xz * xz + xx * yy - xy * xy
+    product = xx * yy_zz - xy * xy_zz + xz * xy_yz
+    found = pairs >= (_LEAST_SPREAD * edge_m) ** 4
+    found &= product <= pairs * np.minimum(_MOST_THICK_M**2, _FLAT * np.sqrt(np.abs(pairs)))
+    return np.asarray(found, np.bool_)
 
 
 def planes(points_m: F64Array, time_s: F64Array, edge_m: float) -> Planes:
@@ -160,6 +175,19 @@ class Distances:
 
     def __len__(self) -> int:
         return len(self.key)
+
+
+NO_DISTANCES = Distances(
+    *(np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0), np.zeros(0)),
+    *(np.zeros((0, 2)), np.zeros((0, 3))),
+)
+
+
+def joined(parts: Sequence[Distances]) -> Distances:
+    """The rows of all parts, in their order."""
+    parts = [NO_DISTANCES, *parts]
+    columns = ([getattr(part, each.name) for part in parts] for each in fields(Distances))
+    return Distances(*map(np.concatenate, columns))
 
 
 def shared_cells(first: Planes, second: Planes) -> tuple[I64Array, I64Array]:

@@ -131,12 +131,12 @@ def test_lidars_that_see_nothing_in_common_leave_all_open() -> None:
 
 
 def test_a_search_that_ends_badly_begins_elsewhere() -> None:
-    """A guess near 20 degrees and 1 m, from which the walls at the ends of a room are missed."""
-    rig = Rig((ORIGIN, motion((-0.72, -0.62, -0.31), (12, -16, 3))), TWIST)
+    """A guess beyond 20 degrees, from which a search finds the floor of a room alone."""
+    rig = Rig((ORIGIN, motion((-0.72, -0.62, -0.31), (12, -16, 24))), TWIST)
     rng = np.random.default_rng(3)
     places = [rig.place(rng, (ROOM, ROOM), 9000) for _ in range(2)]
     ended = find_poses(places, 2)
-    assert ended.weak.shape == (6, 1)
+    assert ended.weak.shape == (6, 3)
     better = better_start(places, ended.state)
     assert better is not None
     found = find_poses(places, 2, guess=better)

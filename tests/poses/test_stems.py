@@ -93,4 +93,4 @@ def test_two_lidars_on_different_sides_agree_on_the_axes() -> None:
 def test_without_points_there_are_no_stems() -> None:
     nothing = stems(np.zeros((0, 3)), np.zeros(0), np.zeros(3))
     assert len(nothing) == 0
-    assert stem_distances(nothing, nothing, 0.97, 1.0) is None
+    assert len(stem_distances(nothing, nothing, 0.97, 1.0)) == 0
