@@ -13,6 +13,7 @@
 #   make casestudy   lidar-inertial odometry of one and two lidars (docs/does-it-help.md)
 #   make fuzz    a million mutated inputs on all cores (INPUTS=..., SEED=..., MINUTES=...)
 #   make fuzz-sanitized   its targets of compiled loops, with sanitizers in the C code
+#   make mutants   how many small changes of the package its tests notice (MUTANTS="--count 60 --seed 1")
 #   make clean   remove what the others made
 
 PYTHON ?= python3
@@ -32,7 +33,7 @@ CONVERT := $(BIN)/mlbatch convert $(RIG)/two_lidars.pcap --rig $(RIG)/rig.yaml -
 
 .DEFAULT_GOAL := help
 .PHONY: help demo test suite coverage test-quick test-lowest test-consumers lint docs bench odometry odometry-quick \
-	casestudy casestudy-quick fuzz fuzz-sanitized clean
+	casestudy casestudy-quick fuzz fuzz-sanitized mutants clean
 
 help:
 	@sed -n 's/^#   //p' Makefile
@@ -106,6 +107,9 @@ fuzz-sanitized: $(VENV)/dev.stamp
 	LD_PRELOAD="$$($(CC) -print-file-name=libasan.so) $$($(CC) -print-file-name=libubsan.so)" \
 		ASAN_OPTIONS=detect_leaks=0:quarantine_size_mb=16 MLBATCH_NATIVE=$(CURDIR)/build/native-sanitized.so \
 		$(BIN)/python -m tests.fuzz.run --target compiled --inputs $(INPUTS) --seed $(SEED) --minutes $(MINUTES)
+
+mutants: $(VENV)/dev.stamp
+	$(BIN)/python -m tests.mutants $(MUTANTS)
 
 clean:
 	rm -rf $(VENV) $(LOWEST) $(CONSUMERS) $(ODOMETRY) demo build mlbatch*.egg-info .coverage .*_cache .hypothesis

@@ -94,6 +94,8 @@ def test_less_than_two_columns_are_no_expectation() -> None:
 
 def test_a_sensor_never_seen_is_expected() -> None:
     assert _fill(_meter(None), _columns(0, 0)) == 0.0
+    # But not in windows that are too short for any other sensor.
+    assert np.isnan(_fill(_meter(0.25), _columns(0, 0), 19 * COLUMN_NS // 10))
 
 
 def test_gaps_count_from_the_last_column_to_the_end_of_the_window() -> None:

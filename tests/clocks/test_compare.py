@@ -8,8 +8,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mlbatch.clocks.compare import CORRECTABLE, SYNCHRONISED, UNSYNCHRONISED, Comparison, compare
+from mlbatch.clocks.compare import (
+    CORRECTABLE,
+    SYNCHRONISED,
+    UNSYNCHRONISED,
+    Comparison,
+    compare,
+    refuse_incomparable,
+)
 from mlbatch.clocks.watch import ClockWatch, Jump
+from mlbatch.errors import ClockError
 from tests.builders.clocks import (
     BEGIN_NS,
     GPS_NS,
@@ -205,3 +213,15 @@ def test_wild_pairs_are_found_whatever_the_verdict() -> None:
         ("a", "b"),
         ("b", "c"),
     }
+
+
+@pytest.mark.parametrize(
+    ("apart_s", "shown"),
+    [(37, "37.000 s (37 s: TAI - UTC): "), (40, "40.000 s: "), (7.3, "7.300 s: ")],
+)
+def test_a_known_difference_is_named_in_the_refusal(apart_s: float, shown: str) -> None:
+    offsets_ns = [("a", 5), ("b", None), ("c", round(apart_s * NS_PER_S) + 5)]
+    with pytest.raises(ClockError) as caught:
+        refuse_incomparable(offsets_ns, 0)
+    assert f"found {shown}stamp minus" in str(caught.value)
+    refuse_incomparable([*offsets_ns[:2], ("c", NS_PER_S + 5)], 0)

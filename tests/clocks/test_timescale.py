@@ -13,6 +13,7 @@ from mlbatch.clocks.timescale import (
     VALID_UNTIL,
     common_timescale,
     gps_utc_s,
+    known_difference,
     tai_utc_s,
     timescale,
 )
@@ -107,6 +108,26 @@ def test_gps_time_began_with_utc_and_is_now_18_s_ahead() -> None:
     assert gps_utc_s(began) == 0
     assert gps_utc_s(_ns("2024-05-01")) == 18
     assert TAI_GPS_S == 19
+
+
+# In 2026: TAI - UTC is 37 s; GPS time counts from 3657 days after 1970, and is 18 s ahead of UTC.
+@pytest.mark.parametrize(
+    ("seconds", "name"),
+    [
+        (37, "37 s: TAI - UTC"),
+        (18, "18 s: GPS - UTC"),
+        (19, "19 s: TAI - GPS"),
+        (3657 * 86_400, "from 1970 to 1980: GPS time without its epoch"),
+        (3657 * 86_400 - 18, "UTC against GPS time from 1980"),
+        (3657 * 86_400 + 18, "315964818 whole second(s)"),
+        (2 * 86_400, "2 whole day(s)"),
+    ],
+)
+def test_differences_of_timescales_are_named(seconds: int, name: str) -> None:
+    for sign in (1, -1):
+        difference_ns = sign * seconds * NS_PER_S
+        found = known_difference(difference_ns + 400, NOON_S * NS_PER_S, 1000)
+        assert found == (difference_ns, name)
 
 
 def test_the_table_grows_by_one_second_at_the_end_of_june_or_december() -> None:

@@ -222,7 +222,9 @@ def test_silence_is_no_jump() -> None:
 
 def test_a_capture_host_that_pauses_is_no_jump() -> None:
     """All packets of 3 s come at once, then of 0.8 s."""
-    assert jumps(heard(way=replace(EXACT, pauses=((4, 3), (12, 0.8))))) == []
+    one = heard(way=replace(EXACT, pauses=((4, 3), (12, 0.8))))
+    assert jumps(one) == []
+    assert [segment.packets for segment in found(one).segments] == [len(one.stamp_ns)]
 
 
 def test_a_fast_change_of_rate_is_no_jump() -> None:
