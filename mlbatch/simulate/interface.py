@@ -14,7 +14,6 @@ from typing import Protocol
 import numpy as np
 
 from mlbatch.arrays import BoolArray, F64Array, I64Array
-from mlbatch.units import NS_PER_S
 
 
 @dataclass(frozen=True, slots=True)
@@ -145,46 +144,8 @@ class Simulator(Protocol):
         ...
 
 
-class SpinningLidar:
-    """What lidars have that packets identify and whose IMU, if they have one, is not supported."""
-
-    rig_model = ""
-    files = LidarFiles()
-    imu: ImuUnit | None = None
-
-    def imu_packets(
-        self, time_ns: I64Array, acceleration: F64Array, angular_velocity: F64Array
-    ) -> list[Sent]:
-        """None."""
-        return []
-
-
-def shots_of(
-    time_ns: I64Array, origin_m: F64Array, direction: F64Array, fires: BoolArray | None = None
-) -> Shots:
-    """Return the rays of columns whose channels fire at (n, c), ns."""
-    firing_ns = time_ns if fires is None else np.where(fires, time_ns, time_ns.max())
-    first_ns = firing_ns.min(axis=1)
-    delay_s: F64Array = (time_ns - first_ns[:, None]) / NS_PER_S
-    return Shots(first_ns, delay_s, origin_m, direction, fires)
-
-
-def readings(
-    distance_m: F64Array, reflectivity: F64Array, unit_m: float, largest: int, returns: int
-) -> tuple[I64Array, I64Array]:
-    """Return counts and levels of packets, (n, c, returns); all returns of a shot are equal."""
-    counts = whole_counts(distance_m, unit_m, largest, None)
-    level = np.where(counts > 0, np.rint(reflectivity), 0.0).astype(np.int64)
-    shape = (*counts.shape, returns)
-    return np.broadcast_to(counts[..., None], shape), np.broadcast_to(level[..., None], shape)
-
-
-def whole_counts(
-    distance_m: F64Array, unit_m: float, largest: int, fires: BoolArray | None
-) -> I64Array:
+def whole_counts(distance_m: F64Array, unit_m: float, largest: int) -> I64Array:
     """Return distances in whole units of a packet; 0 where none comes back or it does not fit."""
     counts = distance_m * (1.0 / unit_m)
     fits = (counts >= 0.5) & (counts < largest + 0.5)
-    if fires is not None:
-        fits &= fires
     return np.rint(np.where(fits, counts, 0.0)).astype(np.int64)

@@ -1,76 +1,50 @@
-"""Packets of lidars of any vendor by the encoders of simulate, and what is needed to read them."""
+"""Packets of spinning lidars of any vendor, by the encoders of simulate, as they are received."""
 
 from __future__ import annotations
 
+from dataclasses import fields, is_dataclass
 from typing import TypeAlias
 
 import numpy as np
 
 from mlbatch.arrays import I64Array
-from mlbatch.simulate.hesai import encode as hesai
-from mlbatch.simulate.hesai.angles import Angles, Beams, MirrorAngles, angles_csv, fan
-from mlbatch.simulate.robosense import encode as robosense
-from mlbatch.simulate.velodyne import encode as velodyne
+from mlbatch.simulate.spinning import SpinningSpec
 
-Spec: TypeAlias = velodyne.VelodyneSpec | hesai.HesaiSpec | robosense.RobosenseSpec
 # Receive time in ns, and payload.
 Payloads: TypeAlias = list[tuple[int, bytes]]
-_HOUR_NS = 3_600_000_000_000
+# From the end of a packet to its receive time.
+_TRAVEL_NS = {"velodyne": 100_000, "hesai": 40_000, "robosense": 200_000}
 
 
-def shape(spec: Spec, packets: int) -> tuple[int, int, int]:
-    """Columns, channels and returns of so many packets."""
-    if isinstance(spec, hesai.HesaiSpec):
-        return packets * spec.groups, spec.row.channels, spec.returns
-    columns = round(packets * spec.columns_per_packet)
-    if isinstance(spec, robosense.RobosenseSpec):
-        return columns, spec.row.channels, spec.returns
-    return columns, len(spec.table.elevation_deg), spec.returns
+def vendor_of(spec: SpinningSpec) -> str:
+    """Folder of the vendor."""
+    return type(spec).__module__.split(".")[-2]
 
 
-def encoded(spec: Spec, counts: I64Array, levels: I64Array) -> Payloads:
+def words_of(spec: object) -> str:
+    """What a spec chooses, for the name of a test."""
+    if not is_dataclass(spec) or not isinstance(spec, SpinningSpec):
+        return str(spec)
+    chosen = [(one.default, getattr(spec, one.name)) for one in fields(spec)]
+    return " ".join(str(value) for default, value in chosen if value != default)
+
+
+def encoded(spec: SpinningSpec, counts: I64Array, levels: I64Array) -> Payloads:
     """Packets of ranges and levels as on the wire, (columns, channels, returns) each."""
-    if isinstance(spec, velodyne.VelodyneSpec):
-        return listed(velodyne.encode(spec, counts, levels))
-    if isinstance(spec, robosense.RobosenseSpec):
-        return robosense.msop(spec, counts, levels)
-    payloads = hesai.encode_packets(spec, counts, levels)
-    return list(zip(hesai.host_times_ns(spec, len(payloads)).tolist(), payloads, strict=True))
+    travel_ns = _TRAVEL_NS[vendor_of(spec)]
+    return [(sent.time_ns + travel_ns, sent.payload) for sent in spec.encode(counts, levels)]
 
 
-def even(spec: Spec, packets: int, count: int, level: int) -> Payloads:
+def even(spec: SpinningSpec, packets: int, count: int, level: int) -> Payloads:
     """Packets of equal readings."""
-    size = shape(spec, packets)
+    size = spec.shape(packets)
     return encoded(spec, np.full(size, count), np.full(size, level))
 
 
-def listed(sent: velodyne.Sent) -> Payloads:
-    """(receive time, payload)."""
-    rows = [payload.tobytes() for payload in sent.payloads]
-    return list(zip(sent.host_ns.tolist(), rows, strict=True))
-
-
-def firing_ns(spec: Spec, payloads: Payloads) -> I64Array:
-    """(columns, channels in the order of the wire) when they fire, by what the packets say."""
-    columns, _, _ = shape(spec, len(payloads))
-    if isinstance(spec, hesai.HesaiSpec):
-        return hesai.firing_times_ns(spec, columns)
-    if isinstance(spec, robosense.RobosenseSpec):
-        return robosense.firing_times_ns(spec, np.arange(columns))
-    fires_ns = velodyne.firing_times_ns(spec, np.arange(columns))
-    # Stamps are whole us past the hour, each of the first firing of a packet.
-    said_us = np.array([int.from_bytes(data[1200:1204], "little") for _, data in payloads])
-    first_ns = fires_ns[:: spec.columns_per_packet].min(axis=1)
-    off_ns = said_us * 1000 - round(spec.table.stamp_after_us * 1000) - first_ns
-    off_ns = (off_ns + _HOUR_NS // 2) % _HOUR_NS - _HOUR_NS // 2
-    said_ns: I64Array = fires_ns + off_ns.repeat(spec.columns_per_packet)[:, None]
-    return said_ns
-
-
-def hesai_unit(model: str, channels: int) -> tuple[Beams, str, bytes]:
-    """Angles of a HESAI, and the name and content of its file."""
-    elevation, azimuth = fan(model, channels)
-    if model == "AT128":
-        mirrors = MirrorAngles((20.0, 140.0, 260.0), elevation, azimuth)
-        return mirrors, "unit.dat", mirrors.dat()
-    return Angles(elevation, azimuth), "unit.csv", angles_csv(elevation, azimuth)
+def device_payloads(spec: SpinningSpec, count: int = 4) -> Payloads:
+    """Packets of the device, as many as it sends in so many of its periods."""
+    travel_ns = _TRAVEL_NS[vendor_of(spec)]
+    after = [
+        number * spec.device_period_ns for number in range(count if spec.device_period_ns else 0)
+    ]
+    return [(spec.begin_ns + at + travel_ns, spec.device_packet(at)) for at in after]

@@ -13,17 +13,13 @@ from mlbatch.arrays import BoolArray, F64Array, I64Array, U8Array
 from mlbatch.lidar.geometry import read_rotor_words
 from mlbatch.lidar.interface import Calibration, Evidence, Lidar, ModelFile, NeighbourStream
 from mlbatch.sensors import built_in, parse_calibration
-from mlbatch.simulate.hesai import encode as hesai
-from mlbatch.simulate.hesai.encode import HesaiSpec
 from mlbatch.simulate.ouster.encode import OusterSpec, metadata_json
-from mlbatch.simulate.robosense import encode as robosense
 from mlbatch.simulate.robosense.encode import RobosenseSpec
-from mlbatch.simulate.velodyne import encode as velodyne
-from mlbatch.simulate.velodyne.encode import VelodyneSpec
+from mlbatch.simulate.spinning import SpinningSpec
 from mlbatch.simulate.velodyne.models import MODELS, calibration_yaml
 from mlbatch.types import ColumnHeaders, Stream
 from tests.builders.decoded import Readings, readings
-from tests.builders.lidar_packets import Spec, encoded, hesai_unit, shape
+from tests.builders.lidar_packets import encoded
 from tests.builders.others import rows
 
 STREAM = Stream("192.168.1.201", 2368)
@@ -31,7 +27,8 @@ DIFOP = Stream("192.168.1.201", 7788)
 # Velodynes with a table of their own; an HDL-64E has a file of its unit.
 PLAIN = tuple(model for model in MODELS if not model.startswith("HDL-64E"))
 MODES = ("strongest", "last", "dual")
-_HESAI_COLUMNS = 420
+# Columns of a stream, if nothing else is said.
+_COLUMNS = 420
 # Packets lie in a wider buffer.
 _MORE_BYTES = 94
 
@@ -57,20 +54,18 @@ class Truth:
 
 @dataclass(frozen=True)
 class Encoded:
-    """Packets (P, size) of random readings, and a calibration for them; sampled: by discovery."""
+    """Packets (P, size) of random readings, and a calibration for them."""
 
     truth: Truth
     packets: U8Array
     host_ns: I64Array
     calibration: Calibration
     neighbours: tuple[NeighbourStream, ...] = ()
-    sampled: int = 16
 
     @property
     def evidence(self) -> Evidence:
         """What discovery knows of the stream."""
-        sample = slice(self.sampled)
-        return evidence_of(self.packets[sample], self.host_ns[sample], self.neighbours)
+        return evidence_of(self.packets, self.host_ns, self.neighbours)
 
     def lidar(self, **options: str) -> Lidar:
         """The decoder."""
@@ -140,13 +135,45 @@ def ouster_calibration(spec: OusterSpec, name: str = "a.json") -> Calibration:
     return from_file(json.dumps(metadata_json(spec)), name)
 
 
-def stream_of(spec: Spec, packets: int = 0) -> Encoded:
-    """A stream of so many packets; 0: a usual number."""
-    if isinstance(spec, VelodyneSpec):
-        return _velodyne(spec, packets or 24)
-    if isinstance(spec, HesaiSpec):
-        return _hesai(spec, packets or _HESAI_COLUMNS // spec.groups)
-    return _robosense(spec, packets or 12)
+def stream_of(spec: SpinningSpec, packets: int = 0) -> Encoded:
+    """A stream of so many packets; 0: a usual number, even, as two may share a column."""
+    random = np.random.default_rng(7)
+    size = spec.shape(packets or max(24, 2 * round(_COLUMNS / spec.columns_per_packet / 2)))
+    # Less is a word, not a range, of an OT128.
+    counts = random.integers(4, spec.largest + 1, size)
+    counts[random.random(size) < 0.1] = 0
+    fires = spec.fires(size[0])
+    counts *= fires[:, :, None]
+    level = random.integers(0, 256, size)
+    sent = encoded(spec, counts, level)
+    # They lie in a wider buffer.
+    wide = rows([payload + bytes(_MORE_BYTES) for _, payload in sent])[:, :-_MORE_BYTES]
+    host_ns = np.array([at for at, _ in sent])
+    column = np.arange(size[0])
+    if spec.columns_per_packet % 1:
+        # A packet cannot contain both returns of all its columns: each is a column of its own.
+        column = column.repeat(2)
+        counts, level = (
+            values.transpose(0, 2, 1).reshape(-1, size[1], 1) for values in (counts, level)
+        )
+    direction = spec.directions(size[0])
+    truth = Truth(
+        counts,
+        level,
+        spec.range_unit_m,
+        spec.firing_times_ns(size[0])[column],
+        fires[column],
+        direction[column],
+        np.broadcast_to(spec.origins(size[0]), direction.shape)[column],
+        np.broadcast_to(spec.range_offset_m, size[1]),
+    )
+    # Those of a Velodyne have the time only.
+    neighbours = difops_of(spec.device_packet(0)) if isinstance(spec, RobosenseSpec) else ()
+    seen = evidence_of(wide, host_ns, neighbours)
+    found = from_file(spec.files.content, f"unit.{spec.files.name}") if spec.files.name else None
+    if spec.rig_model:
+        found = named(spec.rig_model, found)
+    return Encoded(truth, wide, host_ns, found or best_of(seen), neighbours)
 
 
 def fired(lidar: Lidar, headers: ColumnHeaders) -> tuple[I64Array, F64Array, BoolArray]:
@@ -168,90 +195,8 @@ def pointing(lidar: Lidar, angle: F64Array) -> tuple[F64Array, F64Array]:
     return direction, origin
 
 
-def _sent(spec: Spec, counts: I64Array, level: I64Array) -> tuple[U8Array, I64Array]:
-    """Packets, as rows of a wider buffer, and their receive times."""
-    sent = encoded(spec, counts, level)
-    wide = np.pad(rows([payload for _, payload in sent]), ((0, 0), (0, _MORE_BYTES)))
-    return wide[:, :-_MORE_BYTES], np.array([at for at, _ in sent])
-
-
-def _velodyne(spec: VelodyneSpec, packets: int) -> Encoded:
-    rng = np.random.default_rng(7)
-    table = spec.table
-    size = shape(spec, packets)
-    counts = np.where(rng.random(size) < 0.2, 0, rng.integers(1, 65536, size))
-    level = rng.integers(0, 256, size)
-    columns = np.arange(size[0])
-    truth = Truth(
-        counts,
-        level,
-        table.unit_m,
-        velodyne.firing_times_ns(spec, columns),
-        np.ones(size[:2], np.bool_),
-        velodyne.directions(spec, columns),
-        velodyne.origins(spec, columns),
-        np.array(table.dist_m),
-    )
-    return Encoded(truth, *_sent(spec, counts, level), velodyne_calibration(spec.model))
-
-
 def velodyne_calibration(model: str) -> Calibration:
     """The table of a model, or a file of the unit."""
     if model in PLAIN:
         return next(one for one in built_in() if one.model == model)
     return named(model, from_file(calibration_yaml(model), "unit.yaml"))
-
-
-def _hesai(spec: HesaiSpec, packets: int) -> Encoded:
-    random = np.random.default_rng(7)
-    size = shape(spec, packets)
-    counts = random.integers(100, 30000, size)
-    counts[random.random(size) < 0.1] = 0
-    fires = hesai.fires(spec, size[0])
-    counts *= fires[:, :, None]
-    level = random.integers(0, 256, size)
-    beams, name, content = hesai_unit(spec.model, size[1])
-    # When the beams of a JT16 fire is not known.
-    direction = hesai.directions(spec, beams, size[0], turning=spec.model != "JT16")
-    truth = Truth(
-        counts,
-        level,
-        spec.row.unit_mm / 1000,
-        hesai.firing_times_ns(spec, size[0]),
-        fires,
-        direction,
-        np.zeros_like(direction),
-        np.zeros(size[1]),
-    )
-    return Encoded(truth, *_sent(spec, counts, level), from_file(content, name))
-
-
-def _robosense(spec: RobosenseSpec, packets: int) -> Encoded:
-    random = np.random.default_rng(3)
-    size = shape(spec, packets)
-    bits = 14 if spec.model.startswith("Airy") else 16
-    counts, level = random.integers(0, 1 << bits, size), random.integers(0, 256, size)
-    sent, host_ns = _sent(spec, counts, level)
-    angles, columns = robosense.fan(spec), np.arange(size[0])
-    # A unit that turns the other way takes its corrections backwards, too.
-    sense = -1 if spec.is_reversed else 1
-    own = robosense.Angles(angles.elevation_deg, sense * angles.azimuth_deg)
-    if spec.columns_per_packet % 1:
-        # A packet cannot contain both returns of all its columns: each is a column of its own.
-        columns = columns.repeat(2)
-        counts, level = (
-            values.transpose(0, 2, 1).reshape(-1, size[1], 1) for values in (counts, level)
-        )
-    truth = Truth(
-        counts,
-        level,
-        spec.range_unit_m,
-        robosense.firing_times_ns(spec, columns),
-        np.ones(counts.shape[:2], np.bool_),
-        robosense.directions(spec, own, columns),
-        robosense.origins(spec, columns),
-        np.zeros(size[1]),
-    )
-    neighbours = difops_of(robosense.difop(spec, angles))
-    best = best_of(evidence_of(sent, host_ns, neighbours))
-    return Encoded(truth, sent, host_ns, best, neighbours, len(sent))

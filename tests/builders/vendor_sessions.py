@@ -10,11 +10,11 @@ from pathlib import Path
 import numpy as np
 
 from mlbatch.simulate.hesai.angles import angles_csv
-from mlbatch.simulate.robosense import encode as robosense
+from mlbatch.simulate.spinning import SpinningSpec
 from tests.builders import livox
 from tests.builders.bags import Recorded
 from tests.builders.captures import udp_frame, write_pcap
-from tests.builders.lidar_packets import Payloads, Spec, even
+from tests.builders.lidar_packets import Payloads, even
 from tests.builders.messages import Unit as Sender
 from tests.builders.messages import messages
 from tests.builders.sessions import Records, Unit
@@ -26,15 +26,9 @@ RAW_RANGE = 2000
 LEVEL = 50
 
 
-def lidar_payloads(spec: Spec, packets: int) -> Payloads:
+def lidar_payloads(spec: SpinningSpec, packets: int) -> Payloads:
     """(receive time, payload) of packets with points."""
     return even(spec, packets, RAW_RANGE, LEVEL)
-
-
-def difop_payloads(spec: robosense.RobosenseSpec, count: int = 4) -> Payloads:
-    """(receive time, payload) of device packets, ten a second."""
-    payload = robosense.difop(spec, robosense.fan(spec))
-    return [(spec.start_ns + n * 100_000_000, payload) for n in range(count)]
 
 
 def livox_payloads(spec: livox.LivoxSpec, packets: int) -> Payloads:

@@ -5,16 +5,15 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from mlbatch.simulate.hesai.angles import angles_csv, fan
-from mlbatch.simulate.hesai.encode import DUAL, HesaiSpec
+from mlbatch.simulate.hesai.encode import HesaiSpec
 from mlbatch.simulate.robosense.encode import RobosenseSpec
-from mlbatch.simulate.velodyne.encode import VelodyneSpec, position_packets
+from mlbatch.simulate.velodyne.encode import VelodyneSpec
 from mlbatch.simulate.velodyne.models import calibration_yaml
 from tests.builders.bags import Recorded
-from tests.builders.lidar_packets import listed
+from tests.builders.lidar_packets import device_payloads
 from tests.builders.livox import LivoxSpec
 from tests.builders.others import EE, filled
 from tests.builders.points import CLOUD, OUSTER, cloud_message
@@ -24,7 +23,6 @@ from tests.builders.transcripts import transcripts
 from tests.builders.vendor_sessions import (
     BEGIN_NS,
     BEGIN_US,
-    difop_payloads,
     framed,
     hesai_csv,
     lidar_payloads,
@@ -110,7 +108,7 @@ def _write_velodyne(folder: Path) -> None:
     for name, model in (("vlp32c", "VLP-32C"), ("hdl64", "HDL-64E S3")):
         payloads = lidar_payloads(replace(VLP16, model=model), FEW)
         write_capture(folder / name, framed(payloads, IP, PORT))
-    positions = listed(position_packets(VLP16, np.arange(0.0, 4e5, 1e5, dtype=np.float64)))
+    positions = device_payloads(VLP16)
     write_capture(folder / "positions", framed(positions, IP, 8308))
     alike = [(host_ns, payload + bytes(6)) for host_ns, payload in few]
     write_capture(folder / "alike", framed(alike, IP, PORT))
@@ -127,8 +125,9 @@ def _write_velodyne(folder: Path) -> None:
 def _write_velodyne_sessions(folder: Path) -> None:
     few = lidar_payloads(VLP16, FEW)
     behind_us = 20 * 60_000_000
-    late = replace(VLP16, start_us=BEGIN_US + behind_us, host_ahead_ns=-behind_us * 1000)
-    other = framed(lidar_payloads(late, FEW), OTHER_IP, PORT)
+    late = lidar_payloads(replace(VLP16, start_us=BEGIN_US + behind_us), FEW)
+    late = [(host_ns - behind_us * 1000, payload) for host_ns, payload in late]
+    other = framed(late, OTHER_IP, PORT)
     write_capture(folder / "apart", framed(few, IP, PORT), other)
     write_capture(folder / "twins", framed(few, IP, PORT), framed(few, OTHER_IP, PORT))
     write_capture(folder / "pair", framed(few, IP, PORT), ouster().records)
@@ -155,7 +154,7 @@ def _write_hesai(folder: Path) -> None:
     gps = filled(512, {0: EE + b"712190403180", 18: b"$GPRMC"})
     write_capture(folder / "gps", framed([(BEGIN_NS, gps)], IP, 10110))
     many = lidar_payloads(XT16, MANY)
-    dual = lidar_payloads(replace(XT16, mode=DUAL, start_ns=BEGIN_NS + 160_000_000), MANY)
+    dual = lidar_payloads(replace(XT16, mode="dual", start_ns=BEGIN_NS + 160_000_000), MANY)
     write_capture(folder / "xt16_changed", framed(many + dual, IP, PORT))
     hesai_csv(folder / "xt16_changed" / "16.csv", 16)
     later = lidar_payloads(replace(P40, start_ns=BEGIN_NS + 240_000_000), MANY)
@@ -169,7 +168,7 @@ def _write_hesai(folder: Path) -> None:
 
 def _write_robosense(folder: Path) -> None:
     many = lidar_payloads(HELIOS, MANY)
-    device = difop_payloads(HELIOS)
+    device = device_payloads(HELIOS)
     write_capture(folder / "helios_bare", framed(many[:FEW], IP, RS_PORT))
     write_capture(folder / "helios", framed(many, IP, RS_PORT), framed(device, IP, DIFOP_PORT))
     write_capture(folder / "difop", framed(device, IP, DIFOP_PORT))
@@ -199,7 +198,7 @@ def _write_others(folder: Path) -> None:
         for number in range(5)
     ]
     write_rosbag2(folder / "clouds.db3", clouds)
-    raw = rslidar_messages(lidar_payloads(HELIOS, MANY) + difop_payloads(HELIOS))
+    raw = rslidar_messages(lidar_payloads(HELIOS, MANY) + device_payloads(HELIOS))
     write_rosbag2(folder / "both.db3", raw + clouds)
 
 

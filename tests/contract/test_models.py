@@ -30,15 +30,14 @@ from mlbatch.lidar.interface import (
     SensorModel,
 )
 from mlbatch.sensors import Plugin, built_in, models, parse_calibration, plugins
-from mlbatch.simulate.hesai import models as hesai_models
 from mlbatch.simulate.ouster import encode as ouster
-from mlbatch.simulate.robosense import models as robosense_models
-from mlbatch.simulate.velodyne import models as velodyne_tables
+from mlbatch.simulate.spinning import SpinningSpec
 from mlbatch.types import Stream
 from mlbatch.units import NS_PER_S
 from tests.builders import livox, points
 from tests.builders.decoded import readings
-from tests.builders.every_model import CASES, ROBOSENSE_NAMES, Sent
+from tests.builders.every_model import CASES, sent_by
+from tests.builders.lidar_packets import words_of
 from tests.builders.others import rows
 from tests.fuzz.decoding import check_lidar
 
@@ -46,8 +45,6 @@ WORDS = ("real recording", "two sources", "one source")
 ADVICE = "see docs/extend.md"
 SOURCE = "192.168.1.201"
 START_NS = 1_700_000_000_000_000_000
-# Rows of encoders that go by another name than the model, or are a second kind of its packets.
-VARIANTS = {"Pandar64-7": "Pandar64", **ROBOSENSE_NAMES}
 # Sizes of packets that a vendor's module knows, and some unknown ones.
 SIZES = (*range(0, 64), 80, 512, 554, 568, 812, 820, 861, 1072, 1080, 1095, 1127, 1198, 1200, 1206)
 SIZES += (1210, 1212, 1248, 1262, 1266, 1268, 1270, 1362, 1380, 1392, 3392, 6464, 8448, 12608)
@@ -62,15 +59,9 @@ class Stand:
     host_ns: I64Array
 
 
-def encoded() -> frozenset[str]:
-    """Models that the encoders know."""
-    tables = (velodyne_tables.MODELS, hesai_models.MODELS, robosense_models.MODELS)
-    return frozenset(VARIANTS.get(name, name) for table in tables for name in table)
-
-
-def _case(make: Callable[..., Sent], words: tuple[str, ...]) -> Stand:
+def _case(spec: SpinningSpec) -> Stand:
     """The lidar that a case of every_model.py is of."""
-    sent = make(*words)
+    sent = sent_by(spec)
     payloads = sent.payloads
     packets = rows([payload for _, payload in payloads])
     host_ns = np.array([at for at, _ in payloads])
@@ -79,21 +70,19 @@ def _case(make: Callable[..., Sent], words: tuple[str, ...]) -> Stand:
         for at, payload in sent.neighbours
     )
     evidence = Evidence(Stream(SOURCE, 2368), packets.shape[1], packets, host_ns, neighbours)
-    given = parse_calibration(Path(sent.file), sent.content) if sent.file else None
+    given = parse_calibration(Path(sent.file), spec.files.content) if sent.file else None
     known = built_in() if given is None else [given]
-    found = [calibration for one in known if (calibration := _named(one, sent))]
+    found = [calibration for one in known if (calibration := _named(one, spec.rig_model))]
     score, best = max(((one.match_score(evidence), one) for one in found), key=lambda pair: pair[0])
-    assert score > 0 or (score == NAMED_ONLY and sent.is_named)
+    assert score > 0 or (score == NAMED_ONLY and spec.rig_model)
     return Stand(best.lidar({}, evidence), packets, host_ns)
 
 
-def _named(calibration: Calibration, sent: Sent) -> Calibration | None:
-    """A calibration as that of the model a rig names; None if it is another one's."""
-    if not sent.is_named:
+def _named(calibration: Calibration, model: str) -> Calibration | None:
+    """A calibration as that of the model a rig names, if any; None if it is another one's."""
+    if calibration.model == model or not model:
         return calibration
-    if calibration.model == sent.model:
-        return calibration
-    return calibration.for_model(sent.model) if isinstance(calibration, ModelFile) else None
+    return calibration.for_model(model) if isinstance(calibration, ModelFile) else None
 
 
 def _ouster(model: SensorModel) -> Stand:
@@ -125,8 +114,8 @@ def _livox(kind: int) -> Stand:
 def cases() -> Mapping[str, Callable[[], Stand]]:
     """What makes a lidar of each model, in each of its modes."""
     found: dict[str, Callable[[], Stand]] = {}
-    for make, words in CASES:
-        found[" ".join(words)] = partial(_case, make, words)
+    for spec in CASES:
+        found[words_of(spec)] = partial(_case, spec)
     for model in filter(_is_ouster, models()):
         found[model.name] = partial(_ouster, model)
     for kind in (livox.CARTESIAN32, livox.CARTESIAN16, livox.SPHERICAL, livox.DUAL):
@@ -164,13 +153,8 @@ def test_no_two_models_have_one_name() -> None:
 def test_every_model_has_an_encoder_and_a_case(model: SensorModel) -> None:
     if model.name in (*points_kinds(), "Livox SDK2") or _is_ouster(model):
         return  # Their encoders have no rows: any number of beams, or none at all.
-    # Models whose packets look like those of another one are encoded as that one.
-    twins = {words[2]: words[0] for _, words in CASES if len(words) > 2}
-    row = twins.get(model.name, model.same_packets_as or model.name)
-    assert row in encoded(), f"{model.name}: no row in mlbatch/simulate; {ADVICE}"
-    named = {VARIANTS.get(words[0], words[0]) for _, words in CASES}
-    missing = f"{model.name}: no case in tests/builders/every_model.py; {ADVICE}"
-    assert row in named, missing
+    missing = f"{model.name}: no row in mlbatch/simulate; {ADVICE}"
+    assert (model.same_packets_as or model.name) in {one.reported_model for one in CASES}, missing
 
 
 def points_kinds() -> tuple[str, ...]:

@@ -6,7 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from tests.builders.every_model import CASES, SOURCE, job_of
+from tests.builders.every_model import CASES, SOURCE, job_of, sent_by
+from tests.builders.lidar_packets import vendor_of
 from tests.builders.sessions import SMALL, Unit, write_session
 from tests.contract.tree import ROOT, modules, run_python
 
@@ -115,13 +116,13 @@ def _vendors_loaded(arguments: list[str]) -> set[str]:
 @pytest.mark.parametrize("has_rig", [False, True])
 @pytest.mark.parametrize("vendor", ["hesai", "robosense", "velodyne"])
 def test_a_capture_of_one_vendor_loads_no_other(vendor: str, has_rig: bool, tmp_path: Path) -> None:
-    make, words = next(case for case in CASES if case[0].__name__ == f"{vendor}_sent")
-    sent = make(*words)
+    spec = next(spec for spec in CASES if vendor_of(spec) == vendor)
+    sent = sent_by(spec)
     job = job_of(sent, tmp_path)
     arguments = ["convert", str(job.recordings[0]), "--dry-run", "--quiet", "--keep-partial"]
     if has_rig:
         rig = tmp_path / "rig.yaml"
-        named = "" if vendor == "hesai" else f", model: {sent.model}"
+        named = "" if vendor == "hesai" else f", model: {spec.reported_model}"
         file = f", metadata: {sent.file}" if sent.file else ""
         rig.write_text(
             f"sensors: [{{name: one{named}{file}, stream: {{source_ip: {SOURCE}, port: 2368}}, "

@@ -6,7 +6,6 @@ import ctypes
 import shutil
 import subprocess
 import weakref
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, cast
@@ -33,6 +32,7 @@ from mlbatch.pipeline.conversion import Conversion
 from mlbatch.pipeline.sensor import new_ring
 from mlbatch.sensors.ouster.profiles import PROFILES
 from mlbatch.simulate.ouster.encode import OusterSpec
+from mlbatch.simulate.spinning import SpinningSpec
 from mlbatch.types import EXTRAS, RecordLayout, RunInfo, SensorInfo
 from mlbatch.writers.las_encoder import RECORD as LAS
 from mlbatch.writers.point_layouts import (
@@ -74,15 +74,15 @@ PACKED = {
 } | {"las": (LAS, frozenset({"reflectivity"}))}
 # Of all kinds of rotors and pixels.
 OTHERS = (
-    (models.velodyne_sent, ("VLP-16", "dual")),
-    (models.velodyne_sent, ("HDL-64E S3", "strongest")),
-    (models.hesai_sent, ("XT32M2X", "3d")),
-    (models.hesai_sent, ("AT128", "37")),
-    (models.hesai_sent, ("Pandar128E3X", "37")),
-    (models.robosense_sent, ("RS-16", "dual")),
+    models.velodyne("VLP-16", "dual"),
+    models.velodyne("HDL-64E S3", "strongest"),
+    models.hesai("XT32M2X", "triple"),
+    models.hesai("AT128", "strongest"),
+    models.hesai("Pandar128E3X", "strongest"),
+    models.robosense("RS-16", "dual"),
     # Pixels that are not in the order of their shots.
-    (models.velodyne_sent, ("VLS-128", "strongest")),
-    (models.velodyne_sent, ("VLP-32C", "strongest")),
+    models.velodyne("VLS-128", "strongest"),
+    models.velodyne("VLP-32C", "strongest"),
 )
 
 
@@ -97,16 +97,16 @@ def ouster(profile: str, beams: int, seed: int = 0) -> Lidar:
     return ouster_calibration(spec).lidar({}, None)
 
 
-def lidar_of(make: Callable[..., models.Sent], words: tuple[str, ...], folder: Path) -> Lidar:
-    """The lidar that a conversion finds in the packets of a case."""
-    (sensor,) = Conversion(models.job_of(make(*words), folder)).sensors
+def lidar_of(spec: SpinningSpec, folder: Path) -> Lidar:
+    """The lidar that a conversion finds in the packets of a unit."""
+    (sensor,) = Conversion(models.job_of(models.sent_by(spec), folder)).sensors
     return sensor.lidar
 
 
 @pytest.fixture(scope="module")
 def others(tmp_path_factory: pytest.TempPathFactory) -> list[Lidar]:
     """Lidars of other vendors."""
-    return [lidar_of(make, words, tmp_path_factory.mktemp("lidar")) for make, words in OTHERS]
+    return [lidar_of(spec, tmp_path_factory.mktemp("lidar")) for spec in OTHERS]
 
 
 @dataclass(frozen=True, slots=True)

@@ -82,7 +82,7 @@ _MOST_BYTES = 2000
 @lru_cache(maxsize=1)
 def _lidars() -> Sequence[Lidar]:
     with tempfile.TemporaryDirectory() as name:
-        others = [lidar_of(make, words, Path(name)) for make, words in OTHERS]
+        others = [lidar_of(spec, Path(name)) for spec in OTHERS]
     # The loops have a case for 128 beams.
     return (*(ouster(name, beams) for beams in (16, 128) for name in NAMES), *others)
 

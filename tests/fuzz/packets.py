@@ -17,10 +17,11 @@ from mlbatch.errors import MlbatchError
 from mlbatch.lidar.interface import Calibration, Evidence, ModelFile
 from mlbatch.sensors.ouster.profiles import PROFILES
 from mlbatch.simulate.ouster import encode as ouster
-from mlbatch.simulate.robosense import encode as robosense
-from mlbatch.simulate.velodyne import encode as velodyne
+from mlbatch.simulate.robosense.encode import RobosenseSpec, angles_csv
+from mlbatch.simulate.velodyne.encode import VelodyneSpec
 from mlbatch.simulate.velodyne.models import calibration_yaml
-from tests.builders.every_model import CASES
+from tests.builders.every_model import CASES, sent_by
+from tests.builders.lidar_packets import device_payloads, vendor_of
 from tests.builders.livox import (
     CARTESIAN16,
     CARTESIAN32,
@@ -51,26 +52,17 @@ NAMES = (".json", ".yaml", ".xml", ".csv", ".dat")
 def _streams() -> dict[str, Seeds]:
     """Inputs of every vendor: a few packets of each model and mode, and their other packets."""
     found: dict[str, list[bytes]] = {"ouster": [], "livox": _livox()}
-    for make, words in CASES:
-        sent = make(*words)
+    for spec in CASES:
+        sent = sent_by(spec)
         parts = []
         if sent.file:
             kind = NAMES.index(Path(sent.file).suffix)
-            parts.append(Part(CALIBRATION, kind, sent.content))
+            parts.append(Part(CALIBRATION, kind, spec.files.content))
         parts += [Part(_LIDAR_PORT, at, data) for at, data in sent.payloads[:_PACKETS]]
         parts += [Part(DEVICE_PORT, at, data) for at, data in sent.neighbours]
-        found.setdefault(make.__name__.removesuffix("_sent"), []).append(joined(parts))
-    spec = velodyne.VelodyneSpec("VLP-16")
-    position = velodyne.position_packets(spec, np.arange(4, dtype=np.float64) * 5e5)
-    found["velodyne"] += [
-        joined(
-            [*parts_of(found["velodyne"][0])]
-            + [
-                Part(8308, int(at), row.tobytes())
-                for at, row in zip(position.host_ns, position.payloads, strict=True)
-            ]
-        )
-    ]
+        found.setdefault(vendor_of(spec), []).append(joined(parts))
+    positions = [Part(8308, at, data) for at, data in device_payloads(VelodyneSpec("VLP-16"))]
+    found["velodyne"] += [joined([*parts_of(found["velodyne"][0]), *positions])]
     found["ouster"] += [
         _ouster(profile) for profile in PROFILES if "RANGE" in PROFILES[profile].fields
     ]
@@ -145,8 +137,7 @@ def _files() -> dict[str, Seeds]:
         xml_of(entries(64), [1] * 64).encode(),
         xml_of(entries(16)).encode(),
     ]
-    fan = robosense.fan(robosense.RobosenseSpec("Helios 32-31"))
-    found[".csv"].append(robosense.angles_csv(fan).encode())
+    found[".csv"].append(angles_csv(RobosenseSpec("Helios 32-31").angles).encode())
     return {name: tuple(dict.fromkeys(seeds)) for name, seeds in found.items()}
 
 

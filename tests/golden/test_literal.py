@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,8 +9,10 @@ import pytest
 
 from mlbatch.discovery.discover import SensorSelection
 from mlbatch.pipeline.job import Job
+from mlbatch.simulate.spinning import SpinningSpec
 from tests.builders.engines import WANTED, check_conversion
-from tests.builders.every_model import CASES, Sent, job_of
+from tests.builders.every_model import CASES, job_of, sent_by
+from tests.builders.lidar_packets import words_of
 from tests.builders.run import FIXTURE, FOUR_MAKERS
 
 MAKERS = Job(
@@ -21,18 +22,14 @@ MAKERS = Job(
 )
 
 
-@pytest.mark.parametrize(
-    ("make", "words"),
-    CASES,
-    ids=[f"{make.__name__[:-5]} {' '.join(words)}" for make, words in CASES],
-)
-def test_every_model(make: Callable[..., Sent], words: tuple[str, ...], tmp_path: Path) -> None:
-    sent = make(*words)
+@pytest.mark.parametrize("spec", CASES, ids=words_of)
+def test_every_model(spec: SpinningSpec, tmp_path: Path) -> None:
+    sent = sent_by(spec)
     job = job_of(sent, tmp_path)
     pairs = check_conversion(job)
     lidar = pairs[0].sources[0].lidar
     found = (lidar.model, lidar.channels, lidar.returns)
-    assert found == (sent.model, sent.channels, sent.returns)
+    assert found == (spec.reported_model, spec.channels, sent.returns)
     assert sent.types in ((), lidar.return_types)
     everything, _, cut, near, *_ = (pair.decoder.counts[0] for pair in pairs)
     assert everything.written > cut.written

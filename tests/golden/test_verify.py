@@ -7,7 +7,6 @@ columns.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -15,14 +14,7 @@ import pytest
 
 from mlbatch.outputs.stored_scan import COLUMN_NS
 from mlbatch.verification import CHECKS, verify
-from tests.builders.every_model import (
-    Sent,
-    hesai_sent,
-    job_of,
-    robosense_sent,
-    velodyne_sent,
-)
-from tests.builders.lidar_packets import firing_ns
+from tests.builders.every_model import hesai, job_of, robosense, sent_by, velodyne
 from tests.builders.run import ROOT, command
 from tests.golden.test_bag_sessions import SESSIONS
 
@@ -51,23 +43,24 @@ def test_what_a_format_shows_is_checked(form: str, tmp_path: Path) -> None:
     assert {check.name for check in verdict.checks if check.checked} == CHECKED[form]
 
 
-ODD: dict[str, Callable[[], Sent]] = {
-    "HDL-64E": lambda: velodyne_sent("HDL-64E S3", "dual"),
-    "Ruby": lambda: robosense_sent("Ruby 128", "dual"),
-    "QT64": lambda: hesai_sent("PandarQT64", "39"),
-    "JT128": lambda: hesai_sent("JT128", "37"),
-    "Airy": lambda: robosense_sent("Airy 96", "strongest"),
+ODD = {
+    "HDL-64E": velodyne("HDL-64E S3", "dual"),
+    "Ruby": robosense("Ruby 128", "dual"),
+    "QT64": hesai("PandarQT64", "dual"),
+    "JT128": hesai("JT128", "strongest"),
+    "Airy": robosense("Airy 96", "strongest"),
 }
 
 
 @pytest.mark.parametrize("name", ODD)
 def test_odd_lidars_are_clean(name: str, tmp_path: Path) -> None:
-    sent = ODD[name]()
-    longest_ns = int(np.ptp(firing_ns(sent.spec, sent.payloads), axis=1).max())
+    sent = sent_by(ODD[name])
+    columns, _, _ = sent.spec.shape(len(sent.payloads))
+    longest_ns = int(np.ptp(sent.spec.said_times_ns(columns), axis=1).max())
     assert 5 * longest_ns < COLUMN_NS
     (path,) = job_of(sent, tmp_path).recordings
     words: tuple[str | Path, ...] = ("--metadata", tmp_path / sent.file) if sent.file else ()
-    if sent.is_named:
+    if sent.spec.rig_model:
         words = ("--rig", tmp_path / "rig.yaml")
     for layout in ("dense", "organized"):
         target = tmp_path / layout

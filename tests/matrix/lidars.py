@@ -14,12 +14,12 @@ from pathlib import Path
 import numpy as np
 
 from mlbatch.arrays import I64Array
-from mlbatch.simulate.hesai import encode as hesai
 from mlbatch.simulate.hesai.angles import angles_csv
+from mlbatch.simulate.hesai.encode import HesaiSpec
 from mlbatch.simulate.ouster.encode import OusterSpec, encode_packets, metadata_json
-from mlbatch.simulate.robosense import encode as robosense
-from mlbatch.simulate.velodyne import encode as velodyne
-from tests.builders.lidar_packets import Spec, encoded, firing_ns, shape
+from mlbatch.simulate.robosense.encode import RobosenseSpec
+from mlbatch.simulate.spinning import SpinningSpec
+from mlbatch.simulate.velodyne.encode import VelodyneSpec
 
 NS_PER_S = 10**9
 NS_PER_MS = 10**6
@@ -117,37 +117,34 @@ def ouster(spell: Spell) -> Sent:
     return _sent("ouster", spell, payloads, stamps, ranges)
 
 
-def _spun(vendor: str, spell: Spell, seed: int, spec: Spec, per_packet_ns: float) -> Sent:
+def _spun(vendor: str, spell: Spell, seed: int, spec: SpinningSpec) -> Sent:
     """A spinning lidar of 16 channels and one return."""
-    ranges, levels = _readings(seed, *shape(spec, int(spell.length_ns / per_packet_ns)))
-    payloads = encoded(spec, ranges, levels)
-    stamps = firing_ns(spec, payloads).min(axis=1)
-    return _sent(vendor, spell, [data for _, data in payloads], stamps, ranges)
+    packets = int(spell.length_ns / (spec.column_ns * spec.columns_per_packet))
+    ranges, levels = _readings(seed, *spec.shape(packets))
+    payloads = [sent.payload for sent in spec.encode(ranges, levels)]
+    stamps = spec.said_times_ns(len(ranges)).min(axis=1)
+    return _sent(vendor, spell, payloads, stamps, ranges)
 
 
 def velodyne_vlp16(spell: Spell) -> Sent:
     """754 packets a second of 24 columns; no count of packets."""
     hour, past_ns = divmod(spell.begin_ns, HOUR_NS)
-    spec = velodyne.VelodyneSpec(
-        "VLP-16", start_azimuth_deg=93.0, start_us=past_ns / 1000, hour=hour
-    )
-    return _spun("velodyne", spell, 2, spec, spec.row_us * spec.rows_per_packet * 1000)
+    spec = VelodyneSpec("VLP-16", start_azimuth_deg=93.0, start_us=past_ns / 1000, hour=hour)
+    return _spun("velodyne", spell, 2, spec)
 
 
 def hesai_xt16(spell: Spell) -> Sent:
     """2500 packets a second of 8 columns."""
-    spec = hesai.HesaiSpec(
-        "PandarXT-16", start_deg=351.3, start_ns=spell.begin_ns, sequence=spell.count
-    )
-    return _spun("hesai", spell, 3, spec, float(spec.row.step_ns * spec.groups))
+    spec = HesaiSpec("PandarXT-16", start_deg=351.3, start_ns=spell.begin_ns, sequence=spell.count)
+    return _spun("hesai", spell, 3, spec)
 
 
 def robosense_helios16(spell: Spell) -> Sent:
     """750 packets a second of 24 columns."""
-    spec = robosense.RobosenseSpec(
+    spec = RobosenseSpec(
         "Helios 16", start_deg=301.66, start_ns=spell.begin_ns, first_counter=spell.count
     )
-    return _spun("robosense", spell, 4, spec, spec.round_ns * spec.columns_per_packet)
+    return _spun("robosense", spell, 4, spec)
 
 
 @dataclass(frozen=True, slots=True)

@@ -10,13 +10,12 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from mlbatch.arrays import U8Array
+from mlbatch.arrays import I64Array, U8Array
 from mlbatch.discovery.sampler import Sampler
 from mlbatch.lidar.interface import Evidence
 from mlbatch.readers import open_recording
 from mlbatch.sensors.velodyne import sensor as velodyne
 from mlbatch.sensors.velodyne.packets import VelodyneLidar
-from mlbatch.simulate.velodyne.encode import Sent
 from mlbatch.types import StreamTable
 from tests.recordings import RECORDINGS
 
@@ -32,7 +31,8 @@ class Recorded:
     """Content of a recording, as the readers and the sampler give it; read with the best table."""
 
     evidence: Evidence
-    sent: Sent
+    payloads: U8Array
+    host_ns: I64Array
     lidar: VelodyneLidar
 
 
@@ -47,7 +47,7 @@ def recorded(name: str) -> Recorded:
         host_ns += batch.host_ns[rows].tolist()
     (kind,) = (one for one in sampler.kinds if one[1] == 1206)
     evidence = sampler.evidence(kind)
-    return Recorded(evidence, Sent(np.stack(payloads), np.array(host_ns)), lidar_for(evidence))
+    return Recorded(evidence, np.stack(payloads), np.array(host_ns), lidar_for(evidence))
 
 
 def lidar_for(evidence: Evidence, options: dict[str, str] | None = None) -> VelodyneLidar:
@@ -74,10 +74,8 @@ def test_nmea_gives_the_hour_if_receive_times_do_not(name: str, pulse: str, wron
     moved = one.evidence._replace(host_ns=one.evidence.host_ns + shift_ns, neighbours=neighbours)
     lidar = lidar_for(moved)
     assert lidar.timestamp_mode == pulse
-    headers = lidar.column_headers(one.sent.payloads, one.sent.host_ns + shift_ns)
-    assert (
-        headers.stamp_ns == one.lidar.column_headers(one.sent.payloads, one.sent.host_ns).stamp_ns
-    ).all()
+    headers = lidar.column_headers(one.payloads, one.host_ns + shift_ns)
+    assert (headers.stamp_ns == one.lidar.column_headers(one.payloads, one.host_ns).stamp_ns).all()
     assert abs(headers.stamp_ns[-1, 0] - float(result["device_time_s"]) * 1e9) < US_NS
 
 

@@ -19,15 +19,15 @@ from mlbatch.lidar.interface import NAMED_ONLY, Calibration, Evidence, ModelFile
 from mlbatch.simulate.hesai.angles import angles_csv
 from mlbatch.simulate.hesai.encode import HesaiSpec
 from mlbatch.simulate.ouster.encode import OusterSpec
-from mlbatch.simulate.robosense import encode as robosense
 from mlbatch.simulate.robosense.encode import RobosenseSpec
+from mlbatch.simulate.robosense.encode import angles_csv as robosense_csv
 from mlbatch.simulate.robosense.models import LAST
 from mlbatch.simulate.robosense.models import MODELS as ROBOSENSE
+from mlbatch.simulate.spinning import SpinningSpec
 from mlbatch.simulate.velodyne.encode import VelodyneSpec
 from mlbatch.simulate.velodyne.models import MODELS as VELODYNE
 from mlbatch.simulate.velodyne.models import calibration_yaml
 from mlbatch.types import Stream
-from tests.builders.lidar_packets import Spec, hesai_unit
 from tests.builders.others import filled
 from tests.builders.spinning import (
     STREAM,
@@ -48,7 +48,7 @@ NO_ANGLES = filled(1248, {0: bytes.fromhex("a5ff005a11115555"), 1246: b"\x0f\xf0
 class Unit:
     """A unit; points: bytes of all its packets by place; device: of its DIFOP, None: none comes."""
 
-    spec: Spec
+    spec: SpinningSpec
     points: Mapping[int, bytes] = field(default_factory=dict)
     device: Mapping[int, bytes] | None = field(default_factory=dict)
     packets: int = 8
@@ -61,9 +61,7 @@ class Unit:
             stream.packets[:, at : at + len(value)] = list(value)
         if not isinstance(self.spec, RobosenseSpec):
             return stream
-        fan = robosense.fan(self.spec)
-        parts = self.device or {}
-        difops = [robosense.difop(self.spec, fan, parts=parts)] * (self.device is not None)
+        difops = [self.spec.device_packet(parts=self.device)] * (self.device is not None)
         return replace(stream, neighbours=difops_of(*difops))
 
 
@@ -72,8 +70,8 @@ def file_of(model: str) -> Calibration:
     if model in VELODYNE:
         return from_file(calibration_yaml(model), "unit.yaml")
     if model in ROBOSENSE:
-        return from_file(robosense.angles_csv(robosense.fan(RobosenseSpec(model))))
-    return from_file(hesai_unit(model, HesaiSpec(model).row.channels)[2])
+        return from_file(robosense_csv(RobosenseSpec(model).angles))
+    return from_file(HesaiSpec(model).files.content)
 
 
 def scores(stream: Encoded | Evidence) -> dict[str, int]:
@@ -123,9 +121,7 @@ def test_models_that_packets_fit(unit: Unit, expected: Mapping[str, int]) -> Non
 RS32 = RobosenseSpec("RS-32")
 
 
-@pytest.mark.parametrize(
-    "payload", [robosense.difop(RS32, robosense.fan(RS32)), bytes(1248), bytes(12)]
-)
+@pytest.mark.parametrize("payload", [RS32.device_packet(), bytes(1248), bytes(12)])
 def test_other_packets_fit_none(payload: bytes) -> None:
     assert scores(evidence_of([payload] * 3)) == {}
 
@@ -162,7 +158,7 @@ def test_files_that_packets_fit(file: str, unit: Unit, score: int) -> None:
             lidar.mode.split(",")[0] == f"{'dual' if unit.spec.returns == 2 else 'single'} return"
         )
         assert set(lidar.return_types) == {0}
-        rise = np.sin(np.radians(robosense.fan(unit.spec).elevation_deg))
+        rise = np.sin(np.radians(unit.spec.angles.elevation_deg))
         np.testing.assert_allclose(lidar.beams.direction[2, :, 2], rise, atol=1e-6)
 
 
@@ -371,7 +367,7 @@ def test_a_robosense_is_described_by_its_device_packets() -> None:
     """Topics have points and device packets, of one size; damage of one does no harm."""
     spec = RobosenseSpec("Helios 32", LAST)
     stream = stream_of(spec, 8)
-    good = robosense.difop(spec, robosense.fan(spec))
+    good = spec.device_packet()
     damaged = bytearray(good)
     damaged[470] ^= 0xFF
     expected = stream.lidar()
@@ -398,8 +394,8 @@ SILENT = "expected packets in the first 10 seconds"
 
 def two_units(parts: Mapping[int, bytes]) -> Evidence:
     """An RS-32 next to device packets of another unit and of its own."""
-    theirs = robosense.difop(OTHER, robosense.fan(OTHER), parts=parts)
-    mine = robosense.difop(RS32, robosense.fan(RS32))
+    theirs = OTHER.device_packet(parts=parts)
+    mine = RS32.device_packet()
     stream = Stream(STREAM.source_ip, 6699)
     evidence = Unit(RS32).stream.evidence
     return evidence._replace(stream=stream, neighbours=difops_of(theirs, mine))

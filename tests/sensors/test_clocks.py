@@ -29,11 +29,12 @@ from mlbatch.sensors.velodyne.clock import (
 )
 from mlbatch.simulate.hesai.encode import HesaiSpec, date_field
 from mlbatch.simulate.hesai.models import EPOCH, SINCE_1900
-from mlbatch.simulate.velodyne.encode import Sent, VelodyneSpec, position_packets
+from mlbatch.simulate.velodyne.encode import VelodyneSpec
 from mlbatch.types import Stream
 from tests.builders.others import filled, rows
 from tests.builders.spinning import STREAM, Encoded, stream_of
 
+VLP16 = VelodyneSpec("VLP-16")
 POSITIONS = Stream("192.168.1.201", 8308)
 SECOND_NS, HALF_NS = 1_000_000_000, HOUR_NS // 2
 # 21 January 2016, 08:18:02 UTC: the sentence of the sheet's recording, section 8.
@@ -86,17 +87,17 @@ class TestHours:
 
     def test_around_half_an_hour_all_packets_get_one_hour(self) -> None:
         """The capture host is half an hour ahead, give or take its jitter."""
-        stream = stream_of(VelodyneSpec("VLP-16", host_ahead_ns=HALF_NS), 200)
+        stream = stream_of(VelodyneSpec("VLP-16"), 200)
         jitter_ns = np.random.default_rng(1).integers(-(10**9), 10**9, 200)
-        moved = replace(stream, host_ns=stream.host_ns + jitter_ns)
+        moved = replace(stream, host_ns=stream.host_ns + HALF_NS + jitter_ns)
         stamp_ns = moved.headers(moved.lidar()).stamp_ns.reshape(-1)
         assert (np.diff(stamp_ns) > 0).all()
         away_ns = stamp_ns - stream.truth.time_ns[:, 0]
         assert set(np.rint(away_ns / HOUR_NS).tolist()) < {0.0, 1.0}
 
     def test_a_stream_across_the_full_hour(self) -> None:
-        spec = VelodyneSpec("VLP-32C", start_us=3_599_990_000.0, host_ahead_ns=-900 * SECOND_NS)
-        stream = stream_of(spec, 60)
+        stream = stream_of(VelodyneSpec("VLP-32C", start_us=3_599_990_000.0), 60)
+        stream = replace(stream, host_ns=stream.host_ns - 900 * SECOND_NS)
         stamp_ns = stream.headers(stream.lidar()).stamp_ns.reshape(-1)
         assert np.abs(stamp_ns - stream.truth.time_ns[:, 0]).max() <= 500
 
@@ -107,13 +108,14 @@ class TestHours:
             assert (unknown.headers(unknown.lidar()).stamp_ns >= 0).all()
 
     def test_position_packets_override_receive_times(self) -> None:
-        spec = VelodyneSpec("VLP-16", host_ahead_ns=-7 * HOUR_NS - 1234)
-        sent = stream_of(spec, 16)
+        behind_ns = 7 * HOUR_NS + 1234
+        sent = stream_of(VLP16, 16)
         for valid, hours in ((True, 0), (False, -7)):
-            times_us = np.arange(0, 4e6, 1e6, dtype=np.float64)
-            neighbour = beside_of(position_packets(spec, times_us, valid=valid))
-            offset_ns = clock_offset_ns(sent.packets, sent.host_ns, [neighbour])
-            away_ns = -spec.host_ahead_ns + hours * HOUR_NS
+            payloads = [VLP16.device_packet(at * SECOND_NS, valid=valid) for at in range(4)]
+            host_ns = VLP16.begin_ns + np.arange(4) * SECOND_NS - behind_ns
+            neighbour = beside_of(payloads, host_ns)
+            offset_ns = clock_offset_ns(sent.packets, sent.host_ns - behind_ns, [neighbour])
+            away_ns = behind_ns + hours * HOUR_NS
             assert offset_ns == pytest.approx(away_ns, abs=3_000_000)
 
     def test_nothing_is_no_offset(self) -> None:
@@ -121,10 +123,8 @@ class TestHours:
 
 
 def test_what_positions_say_of_the_pulse() -> None:
-    spec = VelodyneSpec("VLP-16")
-    times_us = np.arange(3, dtype=np.float64)
-    sent = [position_packets(spec, times_us, pps=state) for state in range(4)]
-    words = [pulse([beside_of(one)]) for one in sent]
+    sent = [[VLP16.device_packet(0, pps=state)] * 3 for state in range(4)]
+    words = [pulse([beside_of(one, np.zeros(3, np.int64))]) for one in sent]
     assert words == ["no PPS", "PPS synchronising", "PPS locked", "PPS error"]
     assert pulse([]) == ""
     # Packets of another size, and of the same size but of another kind.
@@ -168,8 +168,8 @@ def times_ns() -> I64Array:
     return np.array([n * step for n in range(16)] + later, np.int64)
 
 
-def beside_of(sent: Sent) -> NeighbourStream:
-    return NeighbourStream(POSITIONS, 512, sent.payloads, sent.host_ns)
+def beside_of(payloads: list[bytes], host_ns: I64Array) -> NeighbourStream:
+    return NeighbourStream(POSITIONS, 512, rows(payloads), host_ns)
 
 
 # -- dates ----------------------------------------------------------------------------------------

@@ -8,15 +8,15 @@ import numpy as np
 import pytest
 
 from mlbatch.lidar.interface import FAULTS
-from mlbatch.simulate.hesai.encode import DUAL, HesaiSpec
+from mlbatch.simulate.hesai.encode import HesaiSpec
 from mlbatch.simulate.robosense.encode import RobosenseSpec
+from mlbatch.simulate.spinning import SpinningSpec
 from mlbatch.simulate.velodyne.encode import VelodyneSpec
-from tests.builders.lidar_packets import Spec
 from tests.builders.spinning import stream_of
 
-XT32 = HesaiSpec("PandarXT-32", DUAL)
+XT32 = HesaiSpec("PandarXT-32", "dual")
 # A stream; byte and content of damage.
-DAMAGE: list[tuple[Spec, dict[str, tuple[int, str]]]] = [
+DAMAGE: list[tuple[SpinningSpec, dict[str, tuple[int, str]]]] = [
     (
         VelodyneSpec("VLP-16", "dual"),
         {
@@ -66,7 +66,7 @@ DAMAGE: list[tuple[Spec, dict[str, tuple[int, str]]]] = [
         for what, damage in table.items()
     ],
 )
-def test_damaged_packets_have_a_bad_header(spec: Spec, at: int, value: str) -> None:
+def test_damaged_packets_have_a_bad_header(spec: SpinningSpec, at: int, value: str) -> None:
     stream = stream_of(spec, packets=8)
     lidar = stream.lidar()
     packets = stream.damaged((at, bytes.fromhex(value)))
@@ -85,7 +85,7 @@ def test_damaged_packets_have_a_bad_header(spec: Spec, at: int, value: str) -> N
         (XT32, 1062, b"\x3b"),
     ],
 )
-def test_what_may_change_is_no_damage(spec: Spec, at: int, value: bytes) -> None:
+def test_what_may_change_is_no_damage(spec: SpinningSpec, at: int, value: bytes) -> None:
     stream = stream_of(spec, packets=8)
     assert not stream.lidar().faults(stream.damaged((at, value))).any()
 

@@ -1,7 +1,7 @@
-"""Encoders against bytes, times and angles worked out by hand from docs/sources.
+"""Encoders against bytes, times and rays worked out by hand from docs/sources.
 
 Bytes of HESAI families are laid out by hand for the decoder (`hesai/test_points.py`), which
-`test_round_trip.py` compares with the encoders; HESAI firing tables: `hesai/test_firing.py`.
+`test_round_trip.py` compares with the encoders; beams and firing times: `test_documents.py`.
 """
 
 from __future__ import annotations
@@ -13,27 +13,19 @@ import numpy as np
 import pytest
 
 from mlbatch.arrays import U8Array
-from mlbatch.simulate.robosense.encode import RobosenseSpec
-from mlbatch.simulate.velodyne.encode import (
-    VelodyneSpec,
-    directions,
-    encode,
-    firing_times_ns,
-    gprmc,
-    origins,
-    position_packets,
-)
-
-FIRST_COLUMN = np.array([0])
+from mlbatch.simulate.velodyne.encode import VelodyneSpec, gprmc
+from tests.builders.others import rows
 
 
 def counted(spec: VelodyneSpec, packets: int) -> U8Array:
     """Payloads: distance 256 x column + laser + 1 (return 1: 32768 more), level: the laser's id."""
-    lasers = len(spec.table.elevation_deg)
-    column = np.arange(packets * spec.columns_per_packet)[:, None, None]
+    columns, lasers, _ = spec.shape(packets)
+    column = np.arange(columns)[:, None, None]
     laser = np.arange(lasers)[:, None]
     distance = 256 * column + laser + 1 + 32768 * np.arange(spec.returns)
-    return encode(spec, distance, np.broadcast_to(laser, distance.shape)).payloads
+    return rows(
+        [one.payload for one in spec.encode(distance, np.broadcast_to(laser, distance.shape))]
+    )
 
 
 def check_bytes(payload: U8Array, expected: str) -> None:
@@ -129,28 +121,6 @@ def test_stamps_of_a_velodyne(spec: VelodyneSpec, first_us: int, second_us: int)
 
 
 @pytest.mark.parametrize(
-    ("model", "laser", "offset_ns"),
-    [
-        ("VLP-16", 15, 34_560),
-        ("Puck Hi-Res", 1, 2_304),
-        ("HDL-32E", 31, 35_712),
-        ("VLP-32C", 1, 0),
-        ("VLP-32C", 31, 34_560),
-        # A slot is 55.277 / 20 = 2.76385 us; that after the eighth group is idle.
-        ("VLS-128", 63, 19_347),
-        ("VLS-128", 64, 24_875),
-        ("VLS-128", 127, 44_222),
-        ("HDL-64E S2", 33, 1_260),
-        ("HDL-64E S2", 63, 45_660),
-        ("HDL-64E S3", 6, 9_700),
-    ],
-)
-def test_firing_times_of_a_velodyne(model: str, laser: int, offset_ns: int) -> None:
-    found = firing_times_ns(VelodyneSpec(model, hour=1, start_us=2.0), FIRST_COLUMN)
-    assert found[0, laser] == 3_600_000_000_000 + 2_000 + offset_ns
-
-
-@pytest.mark.parametrize(
     ("spec", "laser", "direction", "origin_m"),
     [
         # To the right; 1 degree up, 2.304 us late: 0.0082944 degrees on.
@@ -178,14 +148,14 @@ def test_rays_of_a_velodyne(
     origin_m: object,
 ) -> None:
     if direction is not None:
-        found = directions(spec, FIRST_COLUMN)[0, laser]
+        found = spec.directions(1)[0, laser]
         assert found == pytest.approx(direction, abs=1e-7)
     if origin_m is not None:
-        assert origins(spec, FIRST_COLUMN)[0, laser] == origin_m
+        assert spec.origins(1)[0, laser] == origin_m
 
 
 def test_azimuth_of_a_beam_of_a_vls_128() -> None:
-    x, y, _ = directions(VelodyneSpec("VLS-128", rpm=0), FIRST_COLUMN)[0, 8].tolist()
+    x, y, _ = VelodyneSpec("VLS-128", rpm=0).directions(1)[0, 8].tolist()
     assert math.degrees(math.atan2(-y, x)) == pytest.approx(6.354)
 
 
@@ -194,41 +164,13 @@ def test_position_packets() -> None:
     expected = b"$GPRMC,123519,A,4807.038,N,01131.000,E,022.4,084.4,230394,003.1,W*6A\r\n"
     assert gprmc(datetime(1994, 3, 23, 12, 35, 19)) == expected
     spec = VelodyneSpec("VLP-16", hour=10, start_us=3_599_000_000.0)
-    sent = position_packets(spec, np.array([250_000.0, 1_250_000.0]))
-    assert sent.payloads.shape == (2, 512)
+    sent = rows([spec.device_packet(after_ns) for after_ns in (250_000_000, 1_250_000_000)])
+    assert sent.shape == (2, 512)
     # 3 600 000 000 - 750 000 us = d693a400 - 000b71b0, and 250 000 us past the next hour.
-    check_bytes(sent.payloads[0], "198 503288d602")
-    check_bytes(sent.payloads[1], "198 90d0030002")
-    texts = [payload[206:334].tobytes().rstrip(b"\0") for payload in sent.payloads]
+    check_bytes(sent[0], "198 503288d602")
+    check_bytes(sent[1], "198 90d0030002")
+    texts = [payload[206:334].tobytes().rstrip(b"\0") for payload in sent]
     assert texts[0].startswith(b"$GPRMC,105959,A,")
     assert b",010170," in texts[0]
     assert texts[1].startswith(b"$GPRMC,110000,A,")
-    silent = position_packets(spec, np.zeros(1), pps=0, nmea=False).payloads[0]
-    assert not silent[202:].any()
-
-
-# Channels (from 1) of a ROBOSENSE and their us after the round, worked by section 5.
-@pytest.mark.parametrize(
-    ("model", "wanted_us"),
-    [
-        ("RS-16", {1: 0, 2: 2.8, 16: 42.0}),
-        ("RS-32", {1: 0, 15: 40.32, 16: 44.64, 17: 1.44, 32: 46.08}),
-        ("Bpearl v3", {1: 0, 9: 25.68, 17: 1.28, 25: 26.96, 32: 44.88}),
-        ("Bpearl v4", {1: 0, 4: 5.0, 32: 51.71}),
-        ("Helios 32", {1: 0, 2: 1.73, 32: 53.63}),
-        ("Helios 16", {1: 27.68, 2: 29.41, 16: 53.63}),
-        ("Airy 96", {8: 0, 9: 5.712, 96: 93.296}),
-        ("Airy 48", {4: 0, 5: 7.616, 48: 97.104}),
-        ("Ruby 128", {4: 0, 5: 3.236, 64: 48.54, 65: 0, 128: 48.54}),
-        ("Ruby Plus 128", {4: 0, 5: 1.13, 65: 21.14, 66: 23.31, 127: 50.53, 128: 53.771}),
-        ("Ruby 80", {3: 0, 4: 3.236, 40: 48.54, 41: 0, 76: 45.304}),
-        ("Ruby Plus 80", {4: 0, 5: 1.217, 33: 16.941, 74: 42.683, 75: 50.603, 80: 53.771}),
-        ("Ruby Plus 80v", {4: 0, 13: 3.652, 80: 31.963}),
-        ("Ruby 48", {1: 0, 5: 12.944, 6: 12.944, 13: 25.888, 24: 48.54, 25: 0}),
-        ("Ruby Plus 48", {2: 0, 3: 1.217, 32: 23.127, 48: 40.666}),
-    ],
-)
-def test_firing_times_of_a_robosense(model: str, wanted_us: dict[int, float]) -> None:
-    found_ns = RobosenseSpec(model).firing_ns
-    found = {channel: found_ns[channel - 1] / 1000 for channel in wanted_us}
-    assert found == pytest.approx(wanted_us)
+    assert not any(spec.device_packet(0, pps=0, nmea=False)[202:])

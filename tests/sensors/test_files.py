@@ -23,7 +23,7 @@ from mlbatch.errors import RigError
 from mlbatch.sensors.hesai.angles import HesaiAngles, read_angles, read_at128
 from mlbatch.sensors.velodyne.calibration import MAX_BYTES, VelodyneFile, read_velodyne
 from mlbatch.simulate.ouster.encode import OusterSpec, metadata_json
-from mlbatch.simulate.robosense.encode import RobosenseSpec, angles_csv, fan
+from mlbatch.simulate.robosense.encode import RobosenseSpec, angles_csv
 from mlbatch.simulate.velodyne.models import MODELS, calibration_yaml
 from tests.builders.spinning import best_of, from_file, stream_of
 from tests.builders.velodyne_xml import entries, xml_of
@@ -389,7 +389,7 @@ FOREIGN: list[bytes] = [
     b"x,y,z\n" * 40 + text_of(hesai_lines()),
     *(b"{" * 100_000, b"a,b\n" * 200_000),
 ]
-HELIOS = fan(RobosenseSpec("Helios 32"))
+HELIOS = RobosenseSpec("Helios 32").angles
 OWNED = {
     "Ouster": [json.dumps(OUSTER).encode()],
     "Velodyne": [calibration_yaml("VLP-16").encode(), xml_of(entries(64)).encode()],

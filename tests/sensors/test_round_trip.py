@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -17,21 +17,21 @@ import pytest
 
 from mlbatch.lidar.geometry import Mirrors, read_rotor_words
 from mlbatch.sensors import describe
-from mlbatch.sensors.hesai.firing import SAVING, STANDARD
-from mlbatch.simulate.hesai.encode import DUAL, TRIPLE, HesaiSpec
+from mlbatch.simulate.hesai.encode import HesaiSpec
 from mlbatch.simulate.hesai.models import MODELS as HESAI
 from mlbatch.simulate.robosense.encode import RobosenseSpec
 from mlbatch.simulate.robosense.models import AIRY_MOUNTS, LAST, NEAREST
 from mlbatch.simulate.robosense.models import MODELS as ROBOSENSE
+from mlbatch.simulate.spinning import SpinningSpec
 from mlbatch.simulate.velodyne.encode import VelodyneSpec
 from mlbatch.simulate.velodyne.models import MODELS as VELODYNE
-from tests.builders.lidar_packets import Spec
+from tests.builders.lidar_packets import words_of
 from tests.builders.spinning import MODES, PLAIN, Encoded, fired, pointing, stream_of
 
 # Stamps of a Velodyne are whole us, its azimuths whole hundredths of a degree.
 STAMP_NS, AZIMUTH_DEG = 800, 0.012
-# The series of a HESAI's rotor motion, in float32 at up to 120 m.
-SERIES_DEG, SERIES_M = 5e-5, 1e-4
+# The series of a HESAI's rotor motion, in float32 at up to 262 m.
+SERIES_DEG, SERIES_M = 5e-5, 2e-4
 # A block's azimuth is rounded to 0.01 degree; two of them give the speed of a short packet.
 BLOCK_DEG = 0.015
 
@@ -45,7 +45,7 @@ class Case:
     which nothing is sent; speed_at: byte of a field of the speed that has no sign.
     """
 
-    spec: Spec
+    spec: SpinningSpec
     time_ns: float
     angle_deg: float
     per_m: float
@@ -57,15 +57,6 @@ class Case:
     options: Mapping[str, str] = field(default_factory=dict)
 
 
-def words_of(row: object) -> str:
-    """What a spec chooses, for the name of a test."""
-    spec = row.spec if isinstance(row, Case) else row
-    if not isinstance(spec, VelodyneSpec | HesaiSpec | RobosenseSpec):
-        return str(row)
-    chosen = [(one.default, getattr(spec, one.name)) for one in fields(spec)]
-    return " ".join(str(value) for default, value in chosen if value != default)
-
-
 def of_velodyne(
     spec: VelodyneSpec, time_ns: float = STAMP_NS, turns: float = 1, **others: Any
 ) -> Case:
@@ -74,7 +65,7 @@ def of_velodyne(
     return replace(case, **others)
 
 
-def of_hesai(model: str, mode: int = 0x37, speed_at: int = 0, **others: Any) -> Case:
+def of_hesai(model: str, mode: str = "strongest", speed_at: int = 0, **others: Any) -> Case:
     spec = replace(HesaiSpec(model, mode, start_deg=350.07), **others)
     return Case(spec, 0, SERIES_DEG, 0, SERIES_M, speed_at=speed_at)
 
@@ -88,7 +79,7 @@ def of_robosense(spec: RobosenseSpec, time_ns: float = 0, turns: float = 1, **ot
 
 def seen_from(name: str, mode: str, rpm: int) -> Case:
     """180 degrees without columns, after the first column: half of a revolution."""
-    turned_deg = 0.5 * ROBOSENSE[name].round_us * 6e-6 * rpm
+    turned_deg = 0.5 * ROBOSENSE[name].row.round_ns * 6e-9 * rpm
     spec = RobosenseSpec(name, mode, rpm=rpm, start_deg=270.0 - turned_deg, view_deg=(90.0, 270.0))
     # A thousandth of the gap: the speed is known from steps of 0.01 degree.
     return of_robosense(spec, 30e9 / rpm / 1000, turns=2, packets=20, gap_ns=30e9 / rpm - 1000)
@@ -133,15 +124,13 @@ CASES: Sequence[Case] = (
         for sequence_us in (53.3, 53.33, 57.8)
     ),
     *(of_hesai(model) for model in HESAI),
-    *(of_hesai(model, DUAL) for model in HESAI if model not in ("Pandar64-7", "JT16")),
-    of_hesai("XT32M2X", TRIPLE),
+    *(of_hesai(model, "dual") for model in HESAI if model not in ("Pandar64-7", "JT16")),
+    of_hesai("XT32M2X", "triple"),
     *(
         of_hesai(model, mode, operation=operation)
-        for mode in (0x37, DUAL)
-        for model, operation in (
-            *(("OT128", STANDARD), ("Pandar128E3X", STANDARD)),
-            ("Pandar128E3X", SAVING),
-        )
+        for mode in ("strongest", "dual")
+        for model, row in HESAI.items()
+        for operation in row.operations[1:]
     ),
     *(
         of_hesai(model, speed_at=speed_at, rpm=-600, start_deg=10.0)
@@ -167,7 +156,7 @@ CASES: Sequence[Case] = (
 )
 
 
-@pytest.mark.parametrize("case", CASES, ids=words_of)
+@pytest.mark.parametrize("case", CASES, ids=lambda case: words_of(case.spec))
 def test_what_was_sent_comes_back(case: Case) -> None:
     stream = stream_of(case.spec, case.packets)
     if case.speed_at:
@@ -206,11 +195,11 @@ def test_what_was_sent_comes_back(case: Case) -> None:
         # Packets of an HDL-64E do not name the only return.
         (VelodyneSpec("HDL-64E S3", "last"), "single return", (0,)),
         (VelodyneSpec("HDL-64E S3", "dual"), "dual return", (0, 0)),
-        (HesaiSpec("XT32M2X", 0x37), "strongest return", (1,)),
-        (HesaiSpec("XT32M2X", 0x38), "last return", (2,)),
-        (HesaiSpec("XT32M2X", 0x33), "first return", (0,)),
-        (HesaiSpec("XT32M2X", DUAL), "dual return, last and strongest", (0, 0)),
-        (HesaiSpec("XT32M2X", TRIPLE), "triple return, first, last and strongest", (0, 0, 0)),
+        (HesaiSpec("XT32M2X", "strongest"), "strongest return", (1,)),
+        (HesaiSpec("XT32M2X", "last"), "last return", (2,)),
+        (HesaiSpec("XT32M2X", "first"), "first return", (0,)),
+        (HesaiSpec("XT32M2X", "dual"), "dual return, last and strongest", (0, 0)),
+        (HesaiSpec("XT32M2X", "triple"), "triple return, first, last and strongest", (0, 0, 0)),
         *(
             (RobosenseSpec(name, mode), f"single return, {word}", (number,))
             for name in ("RS-16", "RS-32", "Bpearl v4", "Helios 16", "Ruby Plus 48")
@@ -226,7 +215,7 @@ def test_what_was_sent_comes_back(case: Case) -> None:
     ],
     ids=words_of,
 )
-def test_modes(spec: Spec, mode: str, types: tuple[int, ...]) -> None:
+def test_modes(spec: SpinningSpec, mode: str, types: tuple[int, ...]) -> None:
     lidar = stream_of(spec).lidar()
     assert (lidar.mode, lidar.return_types, lidar.returns) == (mode, types, len(types))
 
@@ -248,7 +237,7 @@ def test_modes(spec: Spec, mode: str, types: tuple[int, ...]) -> None:
     ids=words_of,
 )
 def test_counts_wrap_and_packets_without_are_named_by_content(
-    spec: Spec, size: int, modulus: int
+    spec: SpinningSpec, size: int, modulus: int
 ) -> None:
     stream = stream_of(spec)
     lidar = stream.lidar()
@@ -260,7 +249,7 @@ def test_counts_wrap_and_packets_without_are_named_by_content(
         assert numbers[:4].tolist() == [modulus - 2, modulus - 1, 0, 1]
 
 
-def azimuths_of(spec: Spec) -> tuple[range, Literal["big", "little"]]:
+def azimuths_of(spec: SpinningSpec) -> tuple[range, Literal["big", "little"]]:
     """Bytes of the azimuths of blocks, and their order."""
     if isinstance(spec, RobosenseSpec):
         row = spec.row
@@ -289,7 +278,7 @@ def azimuths_of(spec: Spec) -> tuple[range, Literal["big", "little"]]:
     ],
     ids=words_of,
 )
-def test_an_azimuth_of_36000_is_0(spec: Spec) -> None:
+def test_an_azimuth_of_36000_is_0(spec: SpinningSpec) -> None:
     """Units send both; 36001 is damage: of the packet, or of a column of it."""
     stream = stream_of(spec)
     places, order = azimuths_of(spec)
@@ -321,7 +310,7 @@ def test_an_azimuth_of_36000_is_0(spec: Spec) -> None:
 @pytest.mark.parametrize(
     "spec", [VelodyneSpec("VLP-32C"), RobosenseSpec("Helios 32", start_deg=10.0)], ids=words_of
 )
-def test_without_motion_during_a_firing(spec: Spec) -> None:
+def test_without_motion_during_a_firing(spec: SpinningSpec) -> None:
     """Columns keep their angles and beams their times; only the speed is gone."""
     stream = stream_of(spec)
     on, off = stream.lidar(), stream.lidar(firing_azimuth="off")
@@ -344,7 +333,7 @@ def test_without_motion_during_a_firing(spec: Spec) -> None:
     ids=words_of,
 )
 def test_a_rotor_at_rest_has_no_speed_and_no_blind_sector(
-    spec: Spec, jitter: tuple[int, int] | None, within_ns: int
+    spec: SpinningSpec, jitter: tuple[int, int] | None, within_ns: int
 ) -> None:
     stream = stream_of(spec)
     lidar = stream.lidar()

@@ -12,57 +12,64 @@ import struct
 import zlib
 from dataclasses import dataclass, replace
 from datetime import datetime, timedelta
+from typing import ClassVar
 
 import numpy as np
 
 from mlbatch.arrays import BoolArray, F64Array, I64Array, U8Array
-from mlbatch.simulate.hesai.angles import Angles as Angles
-from mlbatch.simulate.hesai.angles import Beams
-from mlbatch.simulate.hesai.angles import MirrorAngles as MirrorAngles
-from mlbatch.simulate.hesai.angles import angles_csv as angles_csv
+from mlbatch.sensors.hesai.firing import NEVER
+from mlbatch.simulate.hesai.angles import Angles, Beams, MirrorAngles, angles_csv, fan
 from mlbatch.simulate.hesai.models import (
     EPOCH,
     HIGH,
     IMU,
     MODELS,
-    NEVER,
     OPERATIONS,
     SAFETY,
     SEQUENCE,
     SIGNATURE,
     SINCE_1900,
-    STATES,
-    TABLES,
     UNIT_FLAGS,
     HesaiModel,
 )
+from mlbatch.simulate.interface import LidarFiles, PacketTopic, Sent
+from mlbatch.simulate.spinning import SpinningSpec
+from mlbatch.units import RAD_PER_DEG
 
-SINGLE = 0x37
-DUAL = 0x39
-TRIPLE = 0x3D
-_RETURNS = {0x33: 1, 0x34: 1, 0x37: 1, 0x38: 1, 0x3D: 3}
+DATA_PORT = 2368
+# Byte of the return mode, and returns.
+MODES = {
+    "first": (0x33, 1),
+    "strongest": (0x37, 1),
+    "last": (0x38, 1),
+    "dual": (0x39, 2),
+    "first and last": (0x3B, 2),
+    "first and strongest": (0x3C, 2),
+    "triple": (0x3D, 3),
+}
+_MIRROR_STARTS_DEG = (20.0, 140.0, 260.0)
+# Azimuths in which an AT128 measures, from the middle of a mirror's field.
+_HALF_VIEW_DEG = 60.0
 _SIGNATURE = bytes(range(32))
 _REVERSED_BITS = bytes(int(f"{byte:08b}"[::-1], 2) for byte in range(256))
-# From the last shot to the receive time of the packet.
-_TRAVEL_NS = 40_000
 
 
 @dataclass(frozen=True)
-class HesaiSpec:
+class HesaiSpec(SpinningSpec):
     """A lidar to imitate.
 
-    start_deg: rotor angle of the first column; start_ns: time of the first packet; date: form of
-    the date field; flags: optional parts, None for all that the model has; operation: of models
-    with protocol 1.4; sequence: of the first packet.
+    start_deg: rotor angle of the first column; start_ns: time of the first packet; flags: optional
+    parts, None for all that the model has; operation: of models with protocol 1.4; sequence: of the
+    first packet.
     """
 
+    topics: ClassVar = {DATA_PORT: PacketTopic("hesai_packets", "hesai_ros_driver/UdpFrame")}
+
     model: str
-    mode: int = SINGLE
+    mode: str = "strongest"
     rpm: int = 600
     start_deg: float = 0.0
     start_ns: int = 1_700_000_000_000_000_000
-    date: str = ""
-    unit_mm: int = 0
     sequence: int = 0
     flags: int | None = None
     operation: str = HIGH
@@ -70,167 +77,194 @@ class HesaiSpec:
     @property
     def row(self) -> HesaiModel:
         """The model's layout, with what the spec chooses."""
-        return _row(self.model, self.operation, self.flags, self.date, self.unit_mm)
+        return _row(self.model, self.operation, self.flags)
+
+    @property
+    def reported_model(self) -> str:
+        """Name of the row."""
+        return self.row.row.name
+
+    @property
+    def channels(self) -> int:
+        """Channels of a block."""
+        return self.row.channels
 
     @property
     def returns(self) -> int:
         """Blocks of a group."""
-        return _RETURNS.get(self.mode, 2)
+        return MODES[self.mode][1]
 
     @property
-    def groups(self) -> int:
-        """Columns of a packet."""
+    def columns_per_packet(self) -> int:
+        """Groups of blocks with an azimuth each."""
         return self.row.blocks // self.returns
+
+    @property
+    def column_ns(self) -> float:
+        """From group to group."""
+        return float(self.row.step_ns)
+
+    @property
+    def range_unit_m(self) -> float:
+        """Metres of a count of range."""
+        return self.row.unit_mm / 1000.0
+
+    @property
+    def begin_ns(self) -> int:
+        """Time of the first packet."""
+        return self.start_ns
+
+    @property
+    def beams(self) -> Beams:
+        """Angles of a made-up unit."""
+        elevation, azimuth = fan(self.model, self.channels)
+        if self.model == "AT128":
+            return MirrorAngles(_MIRROR_STARTS_DEG, elevation, azimuth)
+        return Angles(elevation, azimuth)
+
+    @property
+    def files(self) -> LidarFiles:
+        """The file of these angles."""
+        beams = self.beams
+        if isinstance(beams, MirrorAngles):
+            return LidarFiles("dat", beams.dat())
+        return LidarFiles("csv", angles_csv(*fan(self.model, self.channels)))
 
     def has(self, flag: int) -> bool:
         """Whether the packets have this optional part."""
         return bool(self.row.flags & flag)
 
+    def advanced(self, packets: int) -> HesaiSpec:
+        """The lidar as it is so many packets later; ValueError if that is no whole ns."""
+        row = self.row
+        after_ns = row.step_ns * packets * self.columns_per_packet
+        if after_ns.denominator != 1:
+            raise ValueError(f"{packets} packets last {after_ns} ns, no whole number")
+        turned_deg = float(after_ns * self.rpm * 6 % (360 * 10**9)) * 1e-9
+        return replace(
+            self,
+            start_deg=(self.start_deg + turned_deg) % 360.0,
+            start_ns=self.start_ns + int(after_ns),
+            sequence=(self.sequence + packets) % 2**32,
+        )
+
+    def azimuths_deg(self, columns: int) -> F64Array:
+        """(n,) rotor angles as in the packets."""
+        step_deg = float(self.row.step_ns) * self.rpm * 6e-9
+        units = np.rint((self.start_deg + np.arange(columns) * step_deg) * self.row.units_per_deg)
+        wrapped: F64Array = units % (360 * self.row.units_per_deg) / self.row.units_per_deg
+        return wrapped
+
+    def fires(self, columns: int) -> BoolArray:
+        """(n, channels) which beams fire in a column."""
+        # Tables that count back never contain -1 ns.
+        return np.asarray(_offsets_ns(self, columns) != NEVER)
+
+    def firing_times_ns(self, columns: int) -> I64Array:
+        """(n, channels) when each beam fires; the block's time where it does not."""
+        times: I64Array = _block_times_ns(self, columns)[:, None] + _fired_ns(self, columns)
+        return times
+
+    def directions(self, columns: int) -> F64Array:
+        """(n, channels, 3) unit vectors at each beam's firing; x right, y forward."""
+        rotor = np.repeat(self.azimuths_deg(columns)[:, None], self.channels, axis=1)
+        rotor += (_fired_ns(self, columns) + self.row.azimuth_lag_ns) * (self.rpm * 6e-9)
+        azimuth, elevation = (np.radians(angle) for angle in self.beams.aim(rotor))
+        flat = np.cos(elevation)
+        return np.stack(
+            [flat * np.sin(azimuth), flat * np.cos(azimuth), np.sin(elevation)], axis=-1
+        )
+
+    def in_view(self, directions: F64Array) -> BoolArray:
+        """The middle of the field of an AT128 is at twice 60 degrees of the mirror."""
+        if self.model != "AT128":
+            return super().in_view(directions)
+        azimuth = np.arctan2(directions[..., 0], directions[..., 1]) / RAD_PER_DEG % 360.0
+        return np.asarray(np.abs(azimuth - 120.0) <= _HALF_VIEW_DEG)
+
+    def encode(self, counts: I64Array, levels: I64Array) -> list[Sent]:
+        """Packets of these columns; what a silent beam is given is left out."""
+        row = self.row
+        columns = len(counts)
+        packets = columns // self.columns_per_packet
+        if counts.shape != self.shape(packets):
+            raise ValueError(f"{counts.shape}: no whole packets of {self.columns_per_packet}")
+        blocks = np.zeros((columns, self.returns, row.stride), np.uint8)
+        units = np.rint(self.azimuths_deg(columns) * row.units_per_deg).astype(np.int64)
+        # The AT128's finer azimuth: two bytes of 1/100 deg, then one of 1/25600.
+        coarse, fine = np.divmod(units, row.units_per_deg // 100)
+        blocks[..., :2] = np.frombuffer(row.block_flag or bytes(2), np.uint8)
+        blocks[..., row.azimuth_at : row.azimuth_at + 2] = _bytes_of(coarse, "<u2")[:, None]
+        if row.lead == 3:
+            blocks[..., 2] = fine[:, None]
+        fired = self.fires(columns)[:, :, None]
+        body = blocks[..., row.lead :].reshape(columns, self.returns, row.channels, row.unit)
+        body[..., :2] = _bytes_of(np.where(fired, counts, 0).transpose(0, 2, 1), "<u2")
+        body[..., 2] = np.where(fired, levels, 0).transpose(0, 2, 1)
+        blocks[..., row.lead :] = body.reshape(columns, self.returns, -1)
+        bodies = blocks.reshape(packets, -1)
+        assemble = _jt16 if self.model == "JT16" else _assembled
+        said_ns = _packet_times_ns(self, packets)
+        last_ns = self.firing_times_ns(columns).reshape(packets, -1).max(axis=1)
+        times = zip(said_ns.tolist(), np.maximum(last_ns, said_ns).tolist(), strict=True)
+        return [
+            Sent(ready_ns, DATA_PORT, assemble(self, at, time_ns, bodies[at].tobytes()))
+            for at, (time_ns, ready_ns) in enumerate(times)
+        ]
+
 
 @functools.lru_cache(maxsize=64)
-def _row(model: str, operation: str, flags: int | None, date: str, unit_mm: int) -> HesaiModel:
+def _row(model: str, operation: str, flags: int | None) -> HesaiModel:
     """Return the layout of a model with what a spec chooses."""
     row = MODELS[model]
-    slower = model in STATES and operation != HIGH
+    slower = row.operations and operation != HIGH
     own_flags = row.flags if flags is None else flags
     return replace(
         row,
         step_ns=row.step_ns * (2 if slower else 1),
         flags=own_flags,
         unit=row.unit + (row.grows and (own_flags & UNIT_FLAGS).bit_count()),
-        date=date or row.date,
-        unit_mm=unit_mm or row.unit_mm,
     )
 
 
-def advanced(spec: HesaiSpec, packets: int) -> HesaiSpec:
-    """Return the lidar as it is so many packets later; ValueError if that is no whole ns.
-
-    packets: a multiple of those after which the firing tables repeat.
-    """
-    row = spec.row
-    columns = packets * spec.groups
-    after_ns = row.step_ns * columns
-    if after_ns.denominator != 1:
-        raise ValueError(f"{packets} packets last {after_ns} ns, no whole number")
-    turned_deg = float(after_ns * spec.rpm * 6 % (360 * 10**9)) * 1e-9
-    return replace(
-        spec,
-        start_deg=(spec.start_deg + turned_deg) % 360.0,
-        start_ns=spec.start_ns + int(after_ns),
-        sequence=(spec.sequence + packets) % 2**32,
-    )
-
-
-def packet_times_ns(spec: HesaiSpec, packets: int) -> I64Array:
+def _packet_times_ns(spec: HesaiSpec, packets: int) -> I64Array:
     """(P,) what the packets say: whole microseconds."""
-    step_ns = spec.row.step_ns * spec.groups
+    step_ns = spec.row.step_ns * spec.columns_per_packet
     after_ns = np.arange(packets) * step_ns.numerator // step_ns.denominator
     times: I64Array = (spec.start_ns + after_ns) // 1000 * 1000
     return times
 
 
-def block_times_ns(spec: HesaiSpec, columns: int) -> I64Array:
+def _block_times_ns(spec: HesaiSpec, columns: int) -> I64Array:
     """(n,) packet time and offset of the block, by section 5."""
     row = spec.row
-    groups = spec.groups
+    groups = spec.columns_per_packet
     packet, group = np.divmod(np.arange(columns), groups)
     if row.counts_back:
         # (last block - b) // returns; the blocks of a group give the same.
         offsets = [-int(row.step_ns * (groups - 1 - one)) for one in range(groups)]
     else:
         offsets = [int(row.step_ns * one) for one in range(groups)]
-    times = packet_times_ns(spec, -(-columns // groups))
+    times = _packet_times_ns(spec, -(-columns // groups))
     block_ns: I64Array = times[packet] + row.first_ns + np.array(offsets)[group]
     return block_ns
 
 
-def azimuths_deg(spec: HesaiSpec, columns: int) -> F64Array:
-    """(n,) rotor angles as in the packets."""
-    step_deg = float(spec.row.step_ns) * spec.rpm * 6e-9
-    units = np.rint((spec.start_deg + np.arange(columns) * step_deg) * spec.row.units_per_deg)
-    wrapped: F64Array = units % (360 * spec.row.units_per_deg) / spec.row.units_per_deg
-    return wrapped
-
-
-def offsets_ns(spec: HesaiSpec, columns: int) -> I64Array:
+def _offsets_ns(spec: HesaiSpec, columns: int) -> I64Array:
     """(n, channels) firing of each beam after its block's time; NEVER where it does not fire."""
-    number: I64Array = np.arange(columns)
-    if spec.model == "QT128C2X":
-        # Column 0 is of loop 1; a packet says 1 for loop 1 first.
-        return TABLES["QT128C2X"][number % 2]
-    if spec.model in STATES:
-        tables = [STATES[spec.model][spec.operation, state] for state in range(_states(spec))]
-        return np.stack(tables)[number % len(tables)]
-    return np.broadcast_to(TABLES[spec.model], (columns, spec.row.channels))
+    row = spec.row.row
+    # Column 0 of a QT128 is of loop 1; a packet says 1 for loop 1 first.
+    tables = np.arange(len(row.firing_ns))
+    if spec.row.operations:
+        mode, states = OPERATIONS[spec.operation]
+        tables = row.tables[mode, :states]
+    return row.firing_ns[tables[np.arange(columns) % len(tables)]]
 
 
-def fires(spec: HesaiSpec, columns: int) -> BoolArray:
-    """(n, channels) which beams fire in a column."""
-    offsets = offsets_ns(spec, columns)
-    # Tables that count back never contain -1 ns.
-    return np.asarray(offsets != NEVER)
-
-
-def firing_times_ns(spec: HesaiSpec, columns: int) -> I64Array:
-    """(n, channels) when each beam fires; the block's time where it does not."""
-    offsets = np.where(fires(spec, columns), offsets_ns(spec, columns), 0)
-    times: I64Array = block_times_ns(spec, columns)[:, None] + offsets
-    return times
-
-
-def host_times_ns(spec: HesaiSpec, packets: int) -> I64Array:
-    """(P,) receive times, ns: after the packet's last shot and its time."""
-    last = firing_times_ns(spec, packets * spec.groups).reshape(packets, -1).max(axis=1)
-    receive_ns: I64Array = np.maximum(last, packet_times_ns(spec, packets)) + _TRAVEL_NS
-    return receive_ns
-
-
-def directions(spec: HesaiSpec, beams: Beams, columns: int, *, turning: bool = True) -> F64Array:
-    """(n, channels, 3) unit vectors at each beam's firing, in HESAI's frame: x right, y forward.
-
-    turning: the rotor moves while the beams of a column fire.
-    """
-    rotor = np.repeat(azimuths_deg(spec, columns)[:, None], spec.row.channels, axis=1)
-    if turning:
-        offsets = np.where(fires(spec, columns), offsets_ns(spec, columns), 0)
-        rotor += (offsets + spec.row.azimuth_lag_ns) * (spec.rpm * 6e-9)
-    azimuth, elevation = (np.radians(angle) for angle in beams.aim(rotor))
-    flat = np.cos(elevation)
-    return np.stack([flat * np.sin(azimuth), flat * np.cos(azimuth), np.sin(elevation)], axis=-1)
-
-
-def encode_packets(
-    spec: HesaiSpec, ranges: I64Array, levels: I64Array | None = None
-) -> list[bytes]:
-    """Packets of n columns, whole packets of them.
-
-    ranges: (n, channels, returns) in the spec's unit, 0 no return; levels: the same shape, 0..255.
-    What a silent beam is given is left out.
-    """
-    row = spec.row
-    columns = len(ranges)
-    packets = columns // spec.groups
-    if packets * spec.groups != columns or ranges.shape[1:] != (row.channels, spec.returns):
-        raise ValueError(f"{ranges.shape}: no whole packets of {spec.groups} columns")
-    blocks = np.zeros((columns, spec.returns, row.stride), np.uint8)
-    units = np.rint(azimuths_deg(spec, columns) * row.units_per_deg).astype(np.int64)
-    # The AT128's finer azimuth: two bytes of 1/100 deg, then one of 1/25600.
-    coarse, fine = np.divmod(units, row.units_per_deg // 100)
-    blocks[..., :2] = np.frombuffer(row.block_flag or bytes(2), np.uint8)
-    blocks[..., row.azimuth_at : row.azimuth_at + 2] = _bytes_of(coarse, "<u2")[:, None]
-    if row.lead == 3:
-        blocks[..., 2] = fine[:, None]
-    fired = fires(spec, columns)[:, :, None]
-    body = blocks[..., row.lead :].reshape(columns, spec.returns, row.channels, row.unit)
-    body[..., :2] = _bytes_of(np.where(fired, ranges, 0).transpose(0, 2, 1), "<u2")
-    if levels is not None:
-        body[..., 2] = np.where(fired, levels, 0).transpose(0, 2, 1)
-    blocks[..., row.lead :] = body.reshape(columns, spec.returns, -1)
-    bodies = blocks.reshape(packets, -1)
-    assemble = _jt16 if spec.model == "JT16" else _assembled
-    times = packet_times_ns(spec, packets).tolist()
-    return [assemble(spec, at, times[at], bodies[at].tobytes()) for at in range(packets)]
+def _fired_ns(spec: HesaiSpec, columns: int) -> I64Array:
+    """(n, channels) the same; 0 where a beam does not fire."""
+    offsets = _offsets_ns(spec, columns)
+    return np.where(offsets == NEVER, 0, offsets)
 
 
 def crc32_mpeg2(message: bytes) -> int:
@@ -266,7 +300,7 @@ def _assembled(spec: HesaiSpec, number: int, time_ns: int, body: bytes) -> bytes
 def _tail(spec: HesaiSpec, number: int, time_ns: int) -> bytes:
     place = spec.row.tail
     tail = bytearray(spec.row.tail.size)
-    tail[place.mode] = spec.mode
+    tail[place.mode] = MODES[spec.mode][0]
     tail[place.factory] = 0x42
     # JT128 counts in 0.1 rpm.
     struct.pack_into("<h", tail, place.speed, spec.rpm * spec.row.speed_units_per_rpm)
@@ -274,12 +308,10 @@ def _tail(spec: HesaiSpec, number: int, time_ns: int) -> bytes:
         tail[place.date : place.date + 6] = date_field(time_ns, spec.row.date)
     struct.pack_into("<I", tail, place.micros, time_ns // 1000 % 1_000_000)
     if place.loop:
-        tail[place.loop] = (number * spec.groups + 1) % 2
-    if place.operation:
-        tail[place.operation] = OPERATIONS[spec.operation]
-    if spec.model in STATES:
-        first = number * spec.groups
-        states = _states(spec)
+        tail[place.loop] = (number * spec.columns_per_packet + 1) % 2
+    if spec.row.operations:
+        tail[place.operation], states = OPERATIONS[spec.operation]
+        first = number * spec.columns_per_packet
         fields = [(first + block // spec.returns) % states for block in range(spec.row.blocks)]
         state = sum(one << (14 - 2 * block) for block, one in enumerate(fields))
         struct.pack_into("<H", tail, place.state, state)
@@ -309,10 +341,6 @@ def _jt16(spec: HesaiSpec, number: int, time_ns: int, body: bytes) -> bytes:
 
 def _crc(message: bytes) -> bytes:
     return struct.pack("<I", crc32_mpeg2(message))
-
-
-def _states(spec: HesaiSpec) -> int:
-    return sum(mode == spec.operation for mode, _ in STATES[spec.model])
 
 
 def _bytes_of(values: I64Array, kind: str) -> U8Array:

@@ -173,7 +173,7 @@ class SimulatedOuster:
         # Ranges count from the axis of the rotor, along the beam.
         range_m = distance_m + self._offset_mm * M_PER_MM
         largest = (1 << min(place.width, _RANGE_BITS)) - 1
-        counts = whole_counts(range_m, step_mm * M_PER_MM, largest, None)
+        counts = whole_counts(range_m, step_mm * M_PER_MM, largest)
         level = np.where(counts > 0, np.rint(reflectivity), 0.0)
         found: dict[str, IntLike] = {
             "RANGE": counts * step_mm,

@@ -1,8 +1,8 @@
 """Encoder of Velodyne packets: what a sensor would send, from ranges or from what it would see.
 
-Source: docs/sources/velodyne.md sections 1-3 and 5-9, and nothing of the decoder. A *column* is one
-firing sequence (all lasers once); column n is the n-th that is sent, so a blind sector leaves no
-number out. Returns are in the order of the wire: last, strongest (HDL-64E: strongest, last).
+Source: docs/sources/velodyne.md sections 1-3 and 5-9. A *column* is one firing sequence (all lasers
+once); column n is the n-th that is sent, so a blind sector leaves no number out. Returns are in the
+order of the wire: last, strongest (HDL-64E: strongest, last).
 """
 
 from __future__ import annotations
@@ -10,12 +10,17 @@ from __future__ import annotations
 import functools
 from dataclasses import dataclass, replace
 from datetime import datetime, timedelta, timezone
+from typing import ClassVar
 
 import numpy as np
 
 from mlbatch.arrays import F64Array, I64Array, U8Array
-from mlbatch.simulate.velodyne.models import MODELS, Table
+from mlbatch.simulate.interface import LidarFiles, PacketTopic, Sent
+from mlbatch.simulate.spinning import SpinningSpec
+from mlbatch.simulate.velodyne.models import MODELS, Table, calibration_yaml
+from mlbatch.units import NS_PER_US
 
+DATA_PORT = 2368
 HOUR_US = 3_600_000_000
 NMEA_AT = 206
 NMEA_SIZE = 128
@@ -28,14 +33,19 @@ _STATUS = b"HMSDNYGTV1234567"
 
 
 @dataclass(frozen=True)
-class VelodyneSpec:
-    """A sensor to imitate; model is a key of MODELS (HDL-64E: "HDL-64E S2" or "HDL-64E S3").
+class VelodyneSpec(SpinningSpec):
+    """A sensor to imitate.
 
     start_us: first firing of column 0, us past the hour number `hour` (since 1970); blind_deg:
     azimuths [from, to) in which it does not measure (from > to: through zero); product: byte 1205,
     if not the model's; sequence_us: time of a sequence, if not the model's; stamps_end: the packet
-    is stamped at its end (HDL-32E, section 2); host_ahead_ns: host clock minus sensor clock.
+    is stamped at its end (HDL-32E, section 2).
     """
+
+    topics: ClassVar = {DATA_PORT: PacketTopic("velodyne_packets", "velodyne_msgs/VelodyneScan")}
+    device_port = 8308
+    # The status bytes of an HDL-64E repeat after 16 packets.
+    chunk_packets = 48
 
     model: str
     mode: str = "strongest"
@@ -47,12 +57,32 @@ class VelodyneSpec:
     product: int | None = None
     sequence_us: float | None = None
     stamps_end: bool = False
-    host_ahead_ns: int = 0
 
     @property
     def table(self) -> Table:
-        """The row of the model in the data sheet."""
+        """The unit's beams and packets."""
         return MODELS[self.model]
+
+    @property
+    def reported_model(self) -> str:
+        """Name of the row."""
+        return self.table.row.name
+
+    @property
+    def rig_model(self) -> str:
+        """Nothing in packets distinguishes the series of an HDL-64E, or a Puck LITE."""
+        row = self.table.row
+        return row.name if row.needs_file or row.reported_as != row.name else ""
+
+    @property
+    def device_period_ns(self) -> int:
+        """The HDL-64E has no position packets (section 8)."""
+        return 0 if self.table.row.needs_file else 500_000_000
+
+    @property
+    def channels(self) -> int:
+        """Lasers."""
+        return len(self.table.elevation_deg)
 
     @property
     def returns(self) -> int:
@@ -60,107 +90,122 @@ class VelodyneSpec:
         return 2 if self.mode == "dual" else 1
 
     @property
+    def range_unit_m(self) -> float:
+        """Metres of a count of range."""
+        return self.table.unit_m
+
+    @property
+    def range_offset_m(self) -> F64Array:
+        """(lasers,) corrections of distances."""
+        return np.array(self.table.dist_m)
+
+    @property
+    def files(self) -> LidarFiles:
+        """The HDL-64E has a calibration of each unit."""
+        if not self.table.row.needs_file:
+            return LidarFiles()
+        return LidarFiles("yaml", calibration_yaml(self.model).encode())
+
+    @property
+    def begin_ns(self) -> int:
+        """Time of the first firing."""
+        return round(self.start_us * NS_PER_US) + self.hour * HOUR_US * NS_PER_US
+
+    @property
     def row_us(self) -> float:
         """From one azimuth to the next, without a blind sector between them."""
-        return (self.sequence_us or self.table.sequence_us) * self.table.columns_per_row
+        return (self.sequence_us or self.table.sequence_us) * self.table.form.columns_per_row
+
+    @property
+    def column_ns(self) -> float:
+        """Of a sequence, without a blind sector."""
+        return (self.sequence_us or self.table.sequence_us) * NS_PER_US
 
     @property
     def rows_per_packet(self) -> int:
         """Azimuths of a packet."""
-        return 12 // (len(self.table.flags) * self.returns)
+        return 12 // (len(self.table.form.flags) * self.returns)
 
     @property
     def columns_per_packet(self) -> int:
         """Firing sequences of a packet."""
-        return self.rows_per_packet * self.table.columns_per_row
+        return self.rows_per_packet * self.table.form.columns_per_row
 
-    @property
-    def firing_us(self) -> F64Array:
-        """(lasers,) when each fires, after the first of its sequence."""
-        table = self.table
-        stretch = (self.sequence_us or table.sequence_us) / table.sequence_us
-        return np.array(table.firing_us) * (stretch if table.time_scales else 1.0)
+    def encode(self, counts: I64Array, levels: I64Array) -> list[Sent]:
+        """Packets of these columns."""
+        table, form = self.table, self.table.form
+        rows_per_packet = self.rows_per_packet
+        rows = len(counts) // form.columns_per_row
+        count = rows // rows_per_packet
+        if len(counts) != count * self.columns_per_packet:
+            raise ValueError(f"expected whole packets of {self.columns_per_packet} columns")
+        blocks = len(form.flags) * self.returns
+        packets = np.zeros(count, _PACKET)
+        row_us = _row_us(self, rows)
+        filled = packets["block"][:, : rows_per_packet * blocks]
+        filled["flag"] = np.tile(_flags(self), rows_per_packet)
+        cdeg = np.rint(_azimuth_deg(self, row_us) * 100).astype(np.int64) % 36000
+        filled["azimuth"] = np.repeat(cdeg, blocks).reshape(count, -1)
+        filled["reading"]["distance"] = _in_blocks(self, counts).reshape(*filled.shape, 32)
+        filled["reading"]["level"] = _in_blocks(self, levels).reshape(*filled.shape, 32)
+        packets["stamp_us"] = _stamps_us(self, row_us) % HOUR_US
+        packets["factory"] = _factory(self, table.row.product or form.product, count)
+        end_ns = _epoch_ns(self, self.start_us + row_us.reshape(count, -1)[:, -1] + self.row_us)
+        return [
+            Sent(at, DATA_PORT, packet.tobytes())
+            for at, packet in zip(end_ns.tolist(), packets, strict=True)
+        ]
 
+    def advanced(self, packets: int) -> VelodyneSpec:
+        """The sensor as it is so many packets later, without a blind sector."""
+        after_us = packets * self.rows_per_packet * self.row_us
+        azimuth_deg = float(_azimuth_deg(self, np.array([after_us]))[0]) % 360.0
+        return replace(self, start_us=self.start_us + after_us, start_azimuth_deg=azimuth_deg)
 
-@dataclass(frozen=True)
-class Sent:
-    """Payloads (P, size) and their receive times (P,), ns."""
+    def firing_times_ns(self, columns: int) -> I64Array:
+        """(n, lasers) when the lasers fire."""
+        return _epoch_ns(self, self.start_us + _firing_us(self, columns))
 
-    payloads: U8Array
-    host_ns: I64Array
+    def said_times_ns(self, columns: int) -> I64Array:
+        """(n, lasers) the same by the stamps of the packets, which are whole us."""
+        fires_ns = self.firing_times_ns(columns)
+        first_ns = fires_ns[:: self.columns_per_packet].min(axis=1)
+        row_us = _row_us(self, columns // self.table.form.columns_per_row)
+        stamp_us = self.table.form.stamp_after_us
+        said_us = _stamps_us(self, row_us) + self.hour * HOUR_US
+        off_ns = said_us * NS_PER_US - round(stamp_us * NS_PER_US) - first_ns
+        said_ns: I64Array = fires_ns + off_ns.repeat(self.columns_per_packet)[:, None]
+        return said_ns
 
+    def directions(self, columns: int) -> F64Array:
+        """(n, lasers, 3) unit vectors at each laser's own firing."""
+        alpha = _alpha_rad(self, columns)
+        elevation = np.deg2rad(self.table.elevation_deg)
+        flat = np.cos(elevation)
+        up = np.broadcast_to(np.sin(elevation), alpha.shape)
+        return np.stack((flat * np.cos(alpha), -flat * np.sin(alpha), up), axis=-1)
 
-def encode(spec: VelodyneSpec, distance: I64Array, level: I64Array) -> Sent:
-    """Packets with these counts of distance and levels, each (columns, lasers, returns)."""
-    table = spec.table
-    rows_per_packet = spec.rows_per_packet
-    rows = len(distance) // table.columns_per_row
-    count = rows // rows_per_packet
-    if len(distance) != count * spec.columns_per_packet:
-        raise ValueError(f"expected whole packets of {spec.columns_per_packet} columns")
-    blocks = len(table.flags) * spec.returns
-    packets = np.zeros(count, _PACKET)
-    row_us = _row_us(spec, rows)
-    filled = packets["block"][:, : rows_per_packet * blocks]
-    filled["flag"] = np.tile(_flags(spec), rows_per_packet)
-    cdeg = np.rint(_azimuth_deg(spec, row_us) * 100).astype(np.int64) % 36000
-    filled["azimuth"] = np.repeat(cdeg, blocks).reshape(count, -1)
-    filled["reading"]["distance"] = _in_blocks(spec, distance).reshape(*filled.shape, 32)
-    filled["reading"]["level"] = _in_blocks(spec, level).reshape(*filled.shape, 32)
-    first_us = row_us.reshape(count, rows_per_packet)[:, 0]
-    after_us = 542.592 if spec.stamps_end else table.stamp_after_us
-    stamp_us = np.rint(spec.start_us + first_us + after_us).astype(np.int64)
-    packets["stamp_us"] = stamp_us % HOUR_US
-    packets["factory"] = _factory(spec, count)
-    payloads = packets.view(np.uint8).reshape(count, _PACKET.itemsize)
-    return Sent(payloads, _receive_ns(spec, row_us.reshape(count, -1)[:, -1] + spec.row_us))
+    def origins(self, columns: int) -> F64Array:
+        """(n, lasers, 3) where the rays begin; section 10 with cx = cy = 0."""
+        alpha = _alpha_rad(self, columns)
+        aside_m = np.array(self.table.horizontal_m)
+        up = np.broadcast_to(np.array(self.table.vertical_m), alpha.shape)
+        return np.stack((aside_m * np.sin(alpha), aside_m * np.cos(alpha), up), axis=-1)
 
-
-def advanced(spec: VelodyneSpec, packets: int) -> VelodyneSpec:
-    """Return the sensor as it is so many packets later, without a blind sector."""
-    after_us = packets * spec.rows_per_packet * spec.row_us
-    azimuth_deg = float(_azimuth_deg(spec, np.array([after_us]))[0]) % 360.0
-    return replace(spec, start_us=spec.start_us + after_us, start_azimuth_deg=azimuth_deg)
-
-
-def firing_times_ns(spec: VelodyneSpec, columns: I64Array) -> I64Array:
-    """(n, lasers) when the lasers fire, by the sensor's clock, ns since 1970."""
-    return _epoch_ns(spec, spec.start_us + _firing_us(spec, columns))
-
-
-def directions(spec: VelodyneSpec, columns: I64Array) -> F64Array:
-    """(n, lasers, 3) unit vectors at each laser's own firing, sensor frame."""
-    alpha = _alpha_rad(spec, columns)
-    elevation = np.deg2rad(spec.table.elevation_deg)
-    flat = np.cos(elevation)
-    up = np.broadcast_to(np.sin(elevation), alpha.shape)
-    return np.stack((flat * np.cos(alpha), -flat * np.sin(alpha), up), axis=-1)
-
-
-def origins(spec: VelodyneSpec, columns: I64Array) -> F64Array:
-    """(n, lasers, 3) where the rays begin, m, sensor frame; section 10 with cx = cy = 0."""
-    alpha = _alpha_rad(spec, columns)
-    aside_m = np.array(spec.table.horizontal_m)
-    up = np.broadcast_to(np.array(spec.table.vertical_m), alpha.shape)
-    return np.stack((aside_m * np.sin(alpha), aside_m * np.cos(alpha), up), axis=-1)
-
-
-def position_packets(
-    spec: VelodyneSpec, times_us: F64Array, pps: int = 2, nmea: bool = True, valid: bool = True
-) -> Sent:
-    """Packets of port 8308, sent so long after the sensor's start."""
-    payloads = np.zeros((len(times_us), 512), np.uint8)
-    for payload, time_us in zip(payloads, times_us.tolist(), strict=True):
-        past_us = round(spec.start_us + time_us)
-        payload[198:202] = np.frombuffer((past_us % HOUR_US).to_bytes(4, "little"), np.uint8)
+    def device_packet(
+        self, after_ns: int, pps: int = 2, nmea: bool = True, valid: bool = True
+    ) -> bytes:
+        """A packet of port 8308."""
+        payload = bytearray(512)
+        past_us = round(self.start_us + after_ns / NS_PER_US)
+        payload[198:202] = (past_us % HOUR_US).to_bytes(4, "little")
         payload[202] = pps
         if nmea:
             utc = datetime(1970, 1, 1, tzinfo=timezone.utc) + timedelta(
-                hours=spec.hour, seconds=past_us // 1_000_000
+                hours=self.hour, seconds=past_us // 1_000_000
             )
-            sentence = gprmc(utc, valid).ljust(NMEA_SIZE, b"\0")
-            payload[NMEA_AT : NMEA_AT + NMEA_SIZE] = np.frombuffer(sentence, np.uint8)
-    return Sent(payloads, _receive_ns(spec, np.asarray(times_us, np.float64)))
+            payload[NMEA_AT : NMEA_AT + NMEA_SIZE] = gprmc(utc, valid).ljust(NMEA_SIZE, b"\0")
+        return bytes(payload)
 
 
 def gprmc(utc: datetime, valid: bool = True) -> bytes:
@@ -186,19 +231,31 @@ def _row_us(spec: VelodyneSpec, rows: int) -> F64Array:
     return np.multiply(numbers, spec.row_us, dtype=np.float64)
 
 
-def _firing_us(spec: VelodyneSpec, columns: I64Array) -> F64Array:
+def _stamps_us(spec: VelodyneSpec, row_us: F64Array) -> I64Array:
+    """(P,) stamps of packets past the hour of the start."""
+    after_us = 542.592 if spec.stamps_end else spec.table.form.stamp_after_us
+    stamps: I64Array = np.rint(spec.start_us + row_us[:: spec.rows_per_packet] + after_us).astype(
+        np.int64
+    )
+    return stamps
+
+
+def _firing_us(spec: VelodyneSpec, columns: int) -> F64Array:
     """(n, lasers), after the first firing of column 0."""
-    in_row = spec.table.columns_per_row
-    row_us = _row_us(spec, int(columns.max(initial=0)) // in_row + 1)
-    column_us: F64Array = row_us[columns // in_row] + columns % in_row * (spec.row_us / in_row)
-    return np.add(column_us[:, None], spec.firing_us)
+    in_row = spec.table.form.columns_per_row
+    row, which = np.divmod(np.arange(columns), in_row)
+    column_us: F64Array = _row_us(spec, -(-columns // in_row))[row] + which * (spec.row_us / in_row)
+    table = spec.table
+    stretch = (spec.sequence_us or table.sequence_us) / table.sequence_us
+    firing_us = np.array(table.firing_us) * (stretch if table.form.time_scales else 1.0)
+    return np.add(column_us[:, None], firing_us)
 
 
 def _azimuth_deg(spec: VelodyneSpec, time_us: F64Array) -> F64Array:
     return spec.start_azimuth_deg + spec.rpm * 360.0 / 60e6 * time_us
 
 
-def _alpha_rad(spec: VelodyneSpec, columns: I64Array) -> F64Array:
+def _alpha_rad(spec: VelodyneSpec, columns: int) -> F64Array:
     """(n, lasers) azimuth of the beams, clockwise."""
     rotor_deg = _azimuth_deg(spec, _firing_us(spec, columns))
     beams_deg: F64Array = np.add(rotor_deg, np.array(spec.table.azimuth_deg))
@@ -209,29 +266,24 @@ def _epoch_ns(spec: VelodyneSpec, past_hour_us: F64Array) -> I64Array:
     return np.rint(past_hour_us * 1000).astype(np.int64) + spec.hour * HOUR_US * 1000
 
 
-def _receive_ns(spec: VelodyneSpec, after_start_us: F64Array) -> I64Array:
-    """Receive times of packets sent so long after the start: 0.1 ms of transport."""
-    return _epoch_ns(spec, spec.start_us + after_start_us) + 100_000 + spec.host_ahead_ns
-
-
 def _flags(spec: VelodyneSpec) -> list[int]:
     """Flags of the blocks of a row."""
-    flags = list(spec.table.flags)
-    if spec.table.returns_apart:
+    flags = list(spec.table.form.flags)
+    if spec.table.form.returns_apart:
         return flags * spec.returns
     return [flag for flag in flags for _ in range(spec.returns)]
 
 
 def _in_blocks(spec: VelodyneSpec, values: I64Array) -> I64Array:
     """(columns, lasers, returns) as (rows, blocks of a row, 32)."""
-    rows: I64Array = values.reshape(-1, len(spec.table.flags), 32, spec.returns)
-    order = (0, 3, 1, 2) if spec.table.returns_apart else (0, 1, 3, 2)
+    rows: I64Array = values.reshape(-1, len(spec.table.form.flags), 32, spec.returns)
+    order = (0, 3, 1, 2) if spec.table.form.returns_apart else (0, 1, 3, 2)
     return np.reshape(rows.transpose(order), (len(rows), -1, 32))
 
 
-def _factory(spec: VelodyneSpec, count: int) -> U8Array:
+def _factory(spec: VelodyneSpec, product: int | None, count: int) -> U8Array:
     """Bytes 1204 and 1205."""
-    product = spec.table.product if spec.product is None else spec.product
+    product = product if spec.product is None else spec.product
     if product is None:
         status = np.frombuffer(_STATUS, np.uint8)[np.arange(count) % len(_STATUS)]
         return np.stack((status, (np.arange(count) * 37 % 251).astype(np.uint8)), axis=1)

@@ -8,11 +8,9 @@ import numpy as np
 import pytest
 
 from mlbatch.arrays import F64Array
-from mlbatch.simulate.hesai import encode as hesai
 from mlbatch.simulate.hesai.angles import angles_csv
 from mlbatch.simulate.hesai.encode import HesaiSpec
 from tests.builders.decoded import Rotor, projected, readings
-from tests.builders.lidar_packets import hesai_unit
 from tests.builders.others import filled, rows
 from tests.builders.spinning import evidence_of, from_file, stream_of
 
@@ -27,7 +25,7 @@ def test_optional_parts_of_the_128_channel_family(flags: int) -> None:
     parts = {0: bytes.fromhex("eeff010480008002000401") + bytes([flags]), tail + 12: b"\x38"}
     parts |= {tail + 15: bytes([123, 1, 1, 0, 0, 0]), 14 + unit * 127: b"\x64"}
     packets = rows([filled(size, parts)] * 2)
-    lidar = from_file(hesai_unit("OT128", 128)[2]).lidar({}, evidence_of(packets))
+    lidar = from_file(HesaiSpec("OT128").files.content).lidar({}, evidence_of(packets))
     assert (lidar.model, lidar.mode) == ("OT128", "last return")
     assert not lidar.faults(packets).any()
     assert readings(lidar, packets).range_m[0, 127, 0] == np.float32(0.4)
@@ -68,10 +66,10 @@ def test_optical_centre(body: F64Array) -> None:
     column, centre = 17, np.array([-0.012, 0.03873, 0.0])
     range_m = np.linspace(0.3, 60, 64).astype(np.float32)
     range_m[5] = 0.085
-    azimuth, elevation = np.radians(hesai_unit("Pandar64", 64)[0].aim(np.zeros((1, 64))))[:, 0]
+    azimuth, elevation = np.radians(spec.beams.aim(np.zeros((1, 64))))[:, 0]
     flat = np.cos(elevation)
     units = np.stack([flat * np.sin(azimuth), flat * np.cos(azimuth), np.sin(elevation)], axis=1)
-    rotor = np.radians(hesai.azimuths_deg(spec, 18)[column])
+    rotor = np.radians(spec.azimuths_deg(18)[column])
     expected = []
     for unit, range_one in zip(units, range_m.astype(np.float64), strict=True):
         along = float((unit * centre).sum())

@@ -18,7 +18,7 @@ from mlbatch.lidar.interface import Evidence, Lidar
 from mlbatch.sensors.robosense.difop import Angles, find_difop
 from mlbatch.sensors.robosense.models import AIRY_96, BPEARL_V4, ROWS, RS16, RS32, Model
 from mlbatch.sensors.robosense.sensor import BUILT_IN, MODELS
-from mlbatch.simulate.robosense import encode
+from mlbatch.simulate.robosense.encode import RobosenseSpec
 from tests.builders.others import filled, robosense_packets
 from tests.builders.spinning import best_of, difops_of, evidence_of, fired
 from tests.reference import robosense as reference
@@ -86,11 +86,10 @@ def _head(parts: Mapping[int, bytes], cdeg: int) -> bytes:
 def test_the_real_head_of_a_bpearl(
     parts: Mapping[int, bytes], cdeg: int, model: str, time_ns: int
 ) -> None:
-    spec = encode.RobosenseSpec("Bpearl v3")
     after = {**parts, 12: struct.pack(">I", 6062480)} if 12 in parts else parts
     evidence = evidence_of(
         [_head(parts, cdeg), _head(after, cdeg + 240)],
-        neighbours=difops_of(encode.difop(spec, encode.fan(spec))) if 30 in parts else (),
+        neighbours=difops_of(RobosenseSpec("Bpearl v3").device_packet(0)) if 30 in parts else (),
     )
     lidar = _lidar(evidence)
     assert lidar.model == model

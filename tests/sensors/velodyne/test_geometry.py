@@ -192,7 +192,8 @@ def test_a_file_without_heights_keeps_the_built_in_ones(model: str) -> None:
         lidar = unit_of(lines).lidar({}, seen)
         assert np.abs(lidar.beams.origin[2, :, 2] - heights_m).max() < 1e-5
         assert lidar.notes == (
-            f"unit.yaml: the vertical offsets of all lasers are 0; those of a {model} are used, "
+            f"unit.yaml: the vertical offsets of all lasers are 0; those of a "
+            f"{MODELS[model].row.reported_as} are used, "
             f"up to {np.abs(heights_m).max() * 1000:.1f} mm (vertical_offset=off: none)",
         )
         lowered = unit_of(lines).lidar({"vertical_offset": "off"}, seen)

@@ -1,0 +1,205 @@
+"""Spinning lidars: what the encoder of a vendor offers, and the simulation made of it."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping
+from typing import ClassVar
+
+import numpy as np
+
+from mlbatch.arrays import BoolArray, F64Array, I64Array
+from mlbatch.simulate.interface import (
+    ImuUnit,
+    LidarFiles,
+    LidarSettings,
+    PacketTopic,
+    Sent,
+    Shots,
+    SimulatedLidar,
+    whole_counts,
+)
+from mlbatch.units import NS_PER_S
+
+
+class SpinningSpec(ABC):
+    """A unit to imitate: the shots of its columns, and packets of what they measured.
+
+    A column is a firing of all channels (HESAI: of a group of blocks); column k is the k-th that is
+    sent. Packets take places and forms of fields from the encoder's own tables; angles and firing
+    times are those of the model's row in `mlbatch/sensors`, which the tests compare with the
+    document. The angles of a unit, where models have none, are made up.
+    """
+
+    model: str  # a row of the encoder's table
+    mode: str  # of returns
+    topics: ClassVar[Mapping[int, PacketTopic]]
+    # Where packets of the device go.
+    device_port: ClassVar[int] = 0
+    # Packets after which firing tables and status bytes repeat, and columns and ns are whole.
+    chunk_packets: ClassVar[int] = 60
+
+    @property
+    @abstractmethod
+    def reported_model(self) -> str:
+        """Name of its model in `mlbatch sensors`."""
+
+    @property
+    def rig_model(self) -> str:
+        """Name of the model as in a rig, "" if packets identify it."""
+        return ""
+
+    @property
+    def device_period_ns(self) -> int:
+        """From packet to packet of the device; 0: it sends none."""
+        return 0
+
+    @property
+    @abstractmethod
+    def channels(self) -> int:
+        """Shots of a column."""
+
+    @property
+    @abstractmethod
+    def returns(self) -> int:
+        """Returns of a shot."""
+
+    @property
+    @abstractmethod
+    def columns_per_packet(self) -> float:
+        """Columns of a packet, not whole where packets share one."""
+
+    @property
+    @abstractmethod
+    def column_ns(self) -> float:
+        """From column to column."""
+
+    @property
+    @abstractmethod
+    def range_unit_m(self) -> float:
+        """Metres of a count of range."""
+
+    @property
+    def largest(self) -> int:
+        """Largest count of range."""
+        return 65535
+
+    @property
+    def range_offset_m(self) -> F64Array:
+        """(channels,) or (1,) what ranges are short of the distance from the beam's origin."""
+        return np.zeros(1)
+
+    @property
+    def files(self) -> LidarFiles:
+        """Calibration of the unit."""
+        return LidarFiles()
+
+    def shape(self, packets: int) -> tuple[int, int, int]:
+        """Columns, channels and returns of so many packets."""
+        return round(packets * self.columns_per_packet), self.channels, self.returns
+
+    @abstractmethod
+    def advanced(self, packets: int) -> SpinningSpec:
+        """The unit as it is so many packets later; a multiple of `chunk_packets`."""
+
+    @abstractmethod
+    def firing_times_ns(self, columns: int) -> I64Array:
+        """(n, channels) when the beams fire, by the sensor's clock."""
+
+    def said_times_ns(self, columns: int) -> I64Array:
+        """(n, channels) the same by the timestamps of the packets, if they are rounded further."""
+        return self.firing_times_ns(columns)
+
+    def fires(self, columns: int) -> BoolArray:
+        """(n, channels) which beams fire in a column."""
+        return np.ones((columns, self.channels), np.bool_)
+
+    @abstractmethod
+    def directions(self, columns: int) -> F64Array:
+        """(n, channels, 3) unit vectors at each beam's firing, sensor frame."""
+
+    def origins(self, columns: int) -> F64Array:
+        """(n, channels, 3) where the beams begin, m, sensor frame; or (1, 1, 3)."""
+        return np.zeros((1, 1, 3))
+
+    def in_view(self, directions: F64Array) -> BoolArray:
+        """(n, channels) whether it measures in these directions."""
+        return np.ones(directions.shape[:2], np.bool_)
+
+    @abstractmethod
+    def encode(self, counts: I64Array, levels: I64Array) -> list[Sent]:
+        """Packets of these columns, which fill whole ones.
+
+        counts, levels: (columns, channels, returns), range (0: no return) and intensity as on the
+        wire. Raises ValueError for parts of packets.
+        """
+
+    def device_packet(self, after_ns: int) -> bytes:
+        """A packet of the device, so long after the start."""
+        raise NotImplementedError
+
+    @property
+    @abstractmethod
+    def begin_ns(self) -> int:
+        """Time of the start, by the sensor's clock."""
+
+
+class SimulatedSpinner:
+    """Columns of a spinning lidar follow each other without a gap; implements `SimulatedLidar`."""
+
+    imu: ImuUnit | None = None
+
+    def __init__(self, spec: SpinningSpec) -> None:
+        self._spec = spec
+        self.rig_model = spec.rig_model
+        self.topics = spec.topics
+        self.files = spec.files
+        self._columns = spec.shape(spec.chunk_packets)[0]
+        self.chunk_s = self._columns * spec.column_ns / NS_PER_S
+
+    def shots(self, chunk: int) -> Shots:
+        """Rays of the columns of a chunk."""
+        spec = self._spec.advanced(chunk * self._spec.chunk_packets)
+        time_ns = spec.firing_times_ns(self._columns)
+        fires = spec.fires(self._columns)
+        first_ns = np.where(fires, time_ns, time_ns.max()).min(axis=1)
+        delay_s: F64Array = (time_ns - first_ns[:, None]) / NS_PER_S
+        direction = spec.directions(self._columns)
+        is_measured = fires & spec.in_view(direction)
+        return Shots(first_ns, delay_s, spec.origins(self._columns), direction, is_measured)
+
+    def packets(self, chunk: int, distance_m: F64Array, reflectivity: F64Array) -> list[Sent]:
+        """Packets of a chunk, and those of the device of the same time."""
+        spec = self._spec.advanced(chunk * self._spec.chunk_packets)
+        range_m = distance_m - spec.range_offset_m
+        counts = whole_counts(range_m, spec.range_unit_m, spec.largest)
+        level = np.where(counts > 0, np.rint(reflectivity), 0.0).astype(np.int64)
+        # All returns of a shot are equal.
+        shape = (*counts.shape, spec.returns)
+        readings = (np.broadcast_to(one[..., None], shape) for one in (counts, level))
+        return spec.encode(*readings) + self._device_packets(chunk)
+
+    def _device_packets(self, chunk: int) -> list[Sent]:
+        period_ns = self._spec.device_period_ns
+        if not period_ns:
+            return []
+        begin_ns, end_ns = (round(one * self.chunk_s * NS_PER_S) for one in (chunk, chunk + 1))
+        return [
+            Sent(
+                self._spec.begin_ns + after_ns,
+                self._spec.device_port,
+                self._spec.device_packet(after_ns),
+            )
+            for after_ns in range(-(-begin_ns // period_ns) * period_ns, end_ns, period_ns)
+        ]
+
+    def imu_packets(
+        self, time_ns: I64Array, acceleration: F64Array, angular_velocity: F64Array
+    ) -> list[Sent]:
+        """None: IMUs of spinning lidars of these vendors are not simulated."""
+        return []
+
+
+def simulator(unit: Callable[[LidarSettings], SpinningSpec]) -> Callable[..., SimulatedLidar]:
+    """Return `Simulator.simulated` of a vendor; unit: the specification of a unit."""
+    return lambda settings: SimulatedSpinner(unit(settings))
