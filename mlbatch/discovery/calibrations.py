@@ -188,7 +188,7 @@ class MetadataCollector:
         return found
 
 
-class TopicCalibration:
+class TopicCalibration(Calibration):
     """A recorded calibration: of the packets in its topic's namespace, or of a capture."""
 
     def __init__(self, inner: Calibration, topic: str, topics: Sequence[str]) -> None:

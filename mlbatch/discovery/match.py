@@ -22,7 +22,7 @@ from mlbatch.discovery.types import DetectedSensor, PacketKind
 from mlbatch.errors import RecordingError, RigError
 from mlbatch.frames.naming import GENERIC, namespace
 from mlbatch.frames.tree import some
-from mlbatch.lidar.interface import NAMED_ONLY, Calibration, Evidence, Lidar, ModelFile
+from mlbatch.lidar.interface import NAMED_ONLY, Calibration, Evidence, Lidar
 from mlbatch.rig.rig import MAX_NAME, RigSensor, StreamSelector
 from mlbatch.types import StreamTable
 
@@ -300,9 +300,7 @@ class ExpectedSensor(NamedTuple):
         if model is None:
             return usable
         return [
-            (one.for_model(model) or one)
-            if isinstance(one, ModelFile) and (one.path is not None or one.model == model)
-            else one
+            (one.for_model(model) or one) if one.path is not None or one.model == model else one
             for one in usable
         ]
 

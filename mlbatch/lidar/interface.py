@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from pathlib import Path
-from typing import NamedTuple, Protocol, runtime_checkable
+from typing import NamedTuple
+
+import numpy as np
 
 from mlbatch.arrays import BoolArray, F64Array, I64Array, U8Array
 from mlbatch.lidar.geometry import BeamTable, Projection
-from mlbatch.lidar.headers import HeaderReader
+from mlbatch.lidar.headers import HeaderReader, Headers, content_keys
 from mlbatch.types import ColumnHeaders, ImuSamples, Stream
+from mlbatch.units import NS_PER_S
 
 # Verdicts of `Lidar.faults`, in the order of their numbers; 0 is a good packet.
 FAULTS = ("", "bad_size", "bad_header", "bad_crc")
@@ -82,36 +86,32 @@ class Evidence(NamedTuple):
 NAMED_ONLY = -1
 
 
-class Calibration(Protocol):
-    """Calibration of one sensor, or (`is_shared`) of all sensors of a model.
+class Calibration(ABC):
+    """Calibration of one sensor, or (`is_shared`) of all sensors of a model."""
 
-    path: of its file; None: built in.
-    """
-
-    path: Path | None
+    # Of its file; None: built in.
+    path: Path | None = None
     model: str
-    serial: str
-    is_shared: bool
+    serial: str = ""
+    is_shared: bool = False
 
+    def for_model(self, name: str) -> Calibration | None:
+        """Return the calibration for the model that the rig names; None if it does not match.
+
+        For files that do not name their model exactly, and packets that fit several.
+        """
+        return None
+
+    @abstractmethod
     def match_score(self, evidence: Evidence) -> int:
         """Score the match with packets: 0: none; larger: more certain; see NAMED_ONLY."""
-        ...
 
+    @abstractmethod
     def lidar(self, options: Mapping[str, str], evidence: Evidence | None) -> Lidar:
         """Make the lidar; options: of `--decode`; evidence: None before any packet.
 
         Raises RigError if the file is unusable, or if packets are needed first.
         """
-        ...
-
-
-@runtime_checkable
-class ModelFile(Calibration, Protocol):
-    """A calibration file that does not name its model exactly."""
-
-    def for_model(self, name: str) -> Calibration | None:
-        """Return the calibration for the model that the rig names; None if it does not match."""
-        ...
 
 
 class Records(NamedTuple):
@@ -197,47 +197,51 @@ def readings(
     )
 
 
-class Lidar(Protocol):
-    """Decoder of the packets of one physical sensor."""
+class Lidar:
+    """Decoder of the packets of one physical sensor.
+
+    Vendors derive theirs, and assign what is only declared here. The rest are defaults: of a sensor
+    without serial number, counter, IMU and known pose, whose beams are described by vectors.
+    """
 
     vendor: str
     model: str
     # "" if unknown.
-    serial: str
+    serial: str = ""
     # The packets contain the serial number.
-    carries_serial: bool
+    carries_serial: bool = False
     # Return mode or profile, for people.
     mode: str
     # Beams of a column, in wire order.
     channels: int
     # Returns of a shot.
     returns: int
-    has_reflectivity: bool
+    has_reflectivity: bool = False
     # Bytes of a payload.
     packet_size: int
     columns_per_packet: int
     # From column to column without gaps; 0: unknown.
-    column_period_ns: float
+    column_period_ns: float = 0.0
     # Share of a revolution in which it is set to measure; None: not known.
-    lit_share: float | None
+    lit_share: float | None = None
     # Positions of the columns in a packet.
     records: Records
     # Readings of the pixels of a record; None: it has coordinates (`projection`).
-    pixels: PixelTable | None
-    # Reads headers by compiled loops; None: the methods below read them.
-    reader: HeaderReader | None
+    pixels: PixelTable | None = None
+    # Reads headers by compiled loops; None: a subclass has methods that read packets.
+    reader: HeaderReader | None = None
     # The sequence number wraps there; 0: packets have none.
-    sequence_modulus: int
+    sequence_modulus: int = 0
     # Destination ports of its packets and of IMU packets by its settings; 0: unknown.
-    lidar_port: int
-    imu_port: int
+    lidar_port: int = 0
+    imu_port: int = 0
     # By return; numbers of docs/sources/outputs.md section 3.
     return_types: tuple[int, ...]
     # How dual returns get their types: "order" (the first is the stronger), "level" (by range and
     # intensity), "" (they keep `return_types`).
-    typed_by: str
+    typed_by: str = "level"
     # A single return is sent once for each return of the mode.
-    sends_twice: bool
+    sends_twice: bool = True
     # (channels,) or (T, channels), output number of each beam; rows as of `firing_ns`.
     channel: I64Array
     # (T, channels), delay of each beam after the timestamp of its column, ns, >= 0. Rotor words
@@ -245,34 +249,41 @@ class Lidar(Protocol):
     firing_ns: I64Array
     beams: BeamTable
     # (4, 4) body_from_sensor, m, if the calibration contains it.
-    extrinsics: F64Array | None
+    extrinsics: F64Array | None = None
     # (4, 4), m, if the vendor's driver has a lidar frame besides the sensor frame.
-    sensor_from_lidar: F64Array | None
+    sensor_from_lidar: F64Array | None = None
     # The vendor's name, or "".
-    timestamp_mode: str
+    timestamp_mode: str = ""
     # Period of incomplete timestamps (an hour), completed by the receive time; 0: complete.
-    clock_period_ns: int
+    clock_period_ns: int = 0
     # Source of the calibration, for people.
     calibration: str
     # Part of the calibration that packets cannot confirm, or "": for information, no warning.
-    unproven: str
-    notes: tuple[str, ...]
+    unproven: str = ""
+    notes: tuple[str, ...] = ()
 
     @property
     def columns_per_s(self) -> float:
         """Columns sent in a second, while it measures and without loss; 0: unknown."""
-        ...
+        return NS_PER_S / self.column_period_ns if self.column_period_ns else 0.0
+
+    def _read(self, packets: U8Array, host_ns: I64Array | None = None) -> Headers:
+        if self.reader is None:
+            raise TypeError(f"{type(self).__name__}: expected a reader, or methods of its own")
+        return self.reader.read_rows(packets, host_ns)
 
     def sent_by_me(self, packets: U8Array) -> BoolArray:
         """Return which packets (P, packet_size) have this sensor's serial number: (P,) bool.
 
         True for packets without a serial number.
         """
-        ...
+        if self.reader is None:
+            return np.ones(len(packets), np.bool_)
+        return self.reader.read_rows(packets).is_mine
 
     def faults(self, packets: U8Array) -> U8Array:
         """Return indices into FAULTS (P,) of packets (P, packet_size)."""
-        ...
+        return self._read(packets).faults
 
     def sequence(self, packets: U8Array) -> I64Array:
         """Return the sequence numbers (P,) of packets, below `sequence_modulus`.
@@ -280,7 +291,7 @@ class Lidar(Protocol):
         Without sequence numbers: a number that only packets of equal content share, or a negative
         one if packets cannot be compared.
         """
-        ...
+        return content_keys(packets) if self.reader is None else self._read(packets).key
 
     def column_headers(self, packets: U8Array, host_ns: I64Array) -> ColumnHeaders:
         """Return timestamps, rotor positions and validity of all columns, without reading pixels.
@@ -288,20 +299,21 @@ class Lidar(Protocol):
         host_ns: (P,) receive times, for clocks without hour or date. The result for a packet does
         not depend on other packets.
         """
-        ...
+        return self._read(packets, host_ns).columns
 
     def is_imu(self, size: int) -> bool:
         """Return whether a payload of this size on the sensor's streams is an IMU packet."""
-        ...
+        return False
 
     def imu(self, payloads: U8Array, sensor: int) -> ImuSamples:
         """Return the samples of IMU packets (P, size), in their order; sensor: its index."""
-        ...
+        nothing = np.empty((0, 3))
+        return ImuSamples(sensor, np.empty(0, np.int64), nothing, nothing)
 
     def sensor_from_imu(self) -> F64Array | None:
         """Return the pose of the IMU in the sensor frame, (4, 4), m; None: no IMU packets."""
-        ...
+        return None
 
     def projection(self, body_from_sensor: F64Array) -> Projection | None:
         """Return how ranges become points of a sensor that `beams` cannot describe; else None."""
-        ...
+        return None

@@ -16,7 +16,6 @@ from mlbatch.lidar.geometry import BeamTable, Projection
 from mlbatch.lidar.interface import BitField, ChannelRun, Lidar, PixelTable, Records, ReturnLayout
 from mlbatch.native.arena import PacketArena
 from mlbatch.pipeline.sensor import new_ring
-from mlbatch.sensors.base import BaseLidar
 from mlbatch.types import EXTRAS, ColumnHeaders, RunInfo, SensorInfo
 
 _NO_BOXES = np.empty((0, 6))
@@ -97,7 +96,7 @@ def readings(
 _UNITS_PER_M = 1 << 20
 
 
-class Rotor(BaseLidar):
+class Rotor(Lidar):
     """A lidar of beams alone: its packets are one column of ranges in 2**-20 m."""
 
     def __init__(

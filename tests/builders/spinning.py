@@ -11,7 +11,7 @@ import numpy as np
 
 from mlbatch.arrays import BoolArray, F64Array, I64Array, U8Array
 from mlbatch.lidar.geometry import read_rotor_words
-from mlbatch.lidar.interface import Calibration, Evidence, Lidar, ModelFile, NeighbourStream
+from mlbatch.lidar.interface import Calibration, Evidence, Lidar, NeighbourStream
 from mlbatch.sensors import built_in, parse_calibration
 from mlbatch.simulate.ouster.encode import OusterSpec, metadata_json
 from mlbatch.simulate.robosense.encode import RobosenseSpec
@@ -116,7 +116,6 @@ def best_of(evidence: Evidence) -> Calibration:
 def named(model: str, calibration: Calibration | None = None) -> Calibration:
     """A calibration (by default that built in), for the model that a rig names."""
     known = calibration or next(one for one in built_in() if one.model == model)
-    assert isinstance(known, ModelFile)
     found = known.for_model(model)
     assert found is not None
     return found

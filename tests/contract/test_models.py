@@ -25,7 +25,6 @@ from mlbatch.lidar.interface import (
     Calibration,
     Evidence,
     Lidar,
-    ModelFile,
     NeighbourStream,
     SensorModel,
 )
@@ -82,7 +81,7 @@ def _named(calibration: Calibration, model: str) -> Calibration | None:
     """A calibration as that of the model a rig names, if any; None if it is another one's."""
     if calibration.model == model or not model:
         return calibration
-    return calibration.for_model(model) if isinstance(calibration, ModelFile) else None
+    return calibration.for_model(model)
 
 
 def _ouster(model: SensorModel) -> Stand:

@@ -14,7 +14,7 @@ import numpy as np
 
 from mlbatch import sensors
 from mlbatch.errors import MlbatchError
-from mlbatch.lidar.interface import Calibration, Evidence, ModelFile
+from mlbatch.lidar.interface import Calibration, Evidence
 from mlbatch.sensors.ouster.profiles import PROFILES
 from mlbatch.simulate.ouster import encode as ouster
 from mlbatch.simulate.robosense.encode import RobosenseSpec, angles_csv
@@ -165,10 +165,8 @@ def _calibrate(suffix: str, data: bytes, folder: Path) -> None:
     if calibration is None:
         return
     rng = random.Random(zlib.crc32(data))
-    every = [calibration]
-    if isinstance(calibration, ModelFile):
-        own = [calibration.for_model(model.name) for model in sensors.models()]
-        every += [one for one in own if one is not None][:3]
+    own = [calibration.for_model(model.name) for model in sensors.models()]
+    every = [calibration, *[one for one in own if one is not None][:3]]
     for one in every:
         try_all(one, rng)
         for evidence in _evidence():

@@ -16,7 +16,7 @@ import pytest
 from mlbatch import sensors
 from mlbatch.arrays import BoolArray
 from mlbatch.discovery.match import best_fits, match
-from mlbatch.lidar.interface import Calibration, ModelFile
+from mlbatch.lidar.interface import Calibration
 from mlbatch.sensors import parse_calibration
 from mlbatch.simulate.hesai.encode import HesaiSpec
 from mlbatch.simulate.hesai.models import MODELS as HESAIS
@@ -88,7 +88,7 @@ def found(spec: SpinningSpec) -> Came:
     calibrations: list[Calibration] = []
     if spec.files.name:
         own = parse_calibration(Path(f"unit.{spec.files.name}"), spec.files.content)
-        if isinstance(own, ModelFile) and spec.rig_model:
+        if own is not None and spec.rig_model:
             own = own.for_model(spec.rig_model)
         assert own is not None
         calibrations.append(own)

@@ -21,12 +21,12 @@ from mlbatch.lidar.interface import (
     FAULTS,
     Calibration,
     Evidence,
+    Lidar,
     PixelTable,
     Records,
     SensorModel,
     readings,
 )
-from mlbatch.sensors.base import BaseLidar
 from mlbatch.types import ColumnHeaders
 
 # A structured array; numpy has no type for the fields of a dtype.
@@ -63,12 +63,10 @@ PACKET = np.dtype(
 PIXELS = PixelTable(READING.itemsize, readings(((2,),), 4, "<u2"), PER_METRE)
 
 
-class ExampleCalibration:
-    """The beams of all units; implements `Calibration`."""
+class ExampleCalibration(Calibration):
+    """The beams of all units."""
 
-    path: Path | None = None
     model = NAME
-    serial = ""
     is_shared = True
 
     def match_score(self, evidence: Evidence) -> int:
@@ -104,7 +102,7 @@ def _begins_right(packets: U8Array) -> BoolArray:
     return right
 
 
-class ExampleLidar(BaseLidar):
+class ExampleLidar(Lidar):
     """Decoder of one Example-4; implements `Lidar`."""
 
     def __init__(self) -> None:

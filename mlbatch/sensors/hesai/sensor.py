@@ -17,8 +17,7 @@ from mlbatch.arrays import F64Array, median
 from mlbatch.errors import RigError
 from mlbatch.lidar.geometry import BeamTable, Projection, spherical
 from mlbatch.lidar.headers import HeaderReader
-from mlbatch.lidar.interface import Calibration, Evidence, Recorded, SensorModel
-from mlbatch.sensors.base import BaseLidar
+from mlbatch.lidar.interface import Calibration, Evidence, Lidar, Recorded, SensorModel
 from mlbatch.sensors.hesai import models as rows
 from mlbatch.sensors.hesai.angles import At128File, HesaiAngles, read_angles, read_at128
 from mlbatch.sensors.hesai.identify import describe, identify
@@ -81,17 +80,13 @@ def read_calibration(path: Path, content: bytes) -> Calibration | None:
     return None if angles is None else HesaiCalibration(angles)
 
 
-class HesaiCalibration:
-    """Angle csv, for any model with as many channels; implements `Calibration`."""
-
-    __slots__ = ("_angles", "is_shared", "model", "path", "serial")
+class HesaiCalibration(Calibration):
+    """Angle csv, for any model with as many channels."""
 
     def __init__(self, angles: HesaiAngles) -> None:
         self._angles = angles
-        self.path: Path | None = angles.path
+        self.path = angles.path
         self.model = f"{VENDOR} of {len(angles.azimuth_rad)} channels"
-        self.serial = ""
-        self.is_shared = False
 
     def match_score(self, evidence: Evidence) -> int:
         """Match score of packets: by channels, then by the elevations of the outer beams."""
@@ -129,17 +124,14 @@ class HesaiCalibration:
         return lidar
 
 
-class At128Calibration:
-    """Correction file of an AT128; implements `Calibration`."""
+class At128Calibration(Calibration):
+    """Correction file of an AT128."""
 
-    __slots__ = ("_file", "is_shared", "model", "path", "serial")
+    model = rows.AT128.name
 
     def __init__(self, file: At128File) -> None:
         self._file = file
-        self.path: Path | None = file.path
-        self.model = rows.AT128.name
-        self.serial = ""
-        self.is_shared = False
+        self.path = file.path
 
     def match_score(self, evidence: Evidence) -> int:
         """Match score of packets."""
@@ -158,8 +150,8 @@ class At128Calibration:
         return At128Lidar(layout, options, evidence, self._file)
 
 
-class HesaiLidar(BaseLidar):
-    """Decoder of one sensor; implements `Lidar`. Frame: x right, y forward, z up."""
+class HesaiLidar(Lidar):
+    """Decoder of one sensor. Frame: x right, y forward, z up."""
 
     def __init__(
         self,

@@ -17,8 +17,7 @@ from mlbatch.arrays import F64Array, I64Array, U8Array, median
 from mlbatch.errors import RigError
 from mlbatch.lidar.geometry import BeamTable, Coordinates
 from mlbatch.lidar.headers import HeaderReader
-from mlbatch.lidar.interface import Calibration, Evidence, Records, SensorModel
-from mlbatch.sensors.base import BaseLidar
+from mlbatch.lidar.interface import Calibration, Evidence, Lidar, Records, SensorModel
 from mlbatch.sensors.livox.identify import describe, identify
 from mlbatch.sensors.livox.packets import (
     HEADER_SIZE,
@@ -65,14 +64,10 @@ _SHARED_STAMP = (
 )
 
 
-class LivoxCalibration:
-    """Livox needs no calibration; implements `Calibration`."""
+class LivoxCalibration(Calibration):
+    """Livox needs no calibration."""
 
-    __slots__ = ()
-
-    path: Path | None = None
     model = SDK2
-    serial = ""
     is_shared = True
 
     def match_score(self, evidence: Evidence) -> int:
@@ -100,8 +95,8 @@ def read_calibration(path: Path, content: bytes) -> Calibration | None:
     return None
 
 
-class LivoxLidar(BaseLidar):
-    """Decoder of one sensor; implements `Lidar`."""
+class LivoxLidar(Lidar):
+    """Decoder of one sensor."""
 
     def __init__(self, kind: PointKind, evidence: Evidence, *, check_crc: bool) -> None:
         packets = evidence.sample[has_points(evidence.sample, kind)]

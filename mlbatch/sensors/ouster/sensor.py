@@ -16,8 +16,7 @@ from mlbatch.arrays import F64Array, I64Array, U8Array, rows_of
 from mlbatch.errors import RigError
 from mlbatch.lidar.geometry import BeamTable
 from mlbatch.lidar.headers import HeaderReader
-from mlbatch.lidar.interface import Calibration, Evidence, Recorded, Records, SensorModel
-from mlbatch.sensors.base import BaseLidar
+from mlbatch.lidar.interface import Calibration, Evidence, Lidar, Recorded, Records, SensorModel
 from mlbatch.sensors.options import check_options
 from mlbatch.sensors.ouster.identify import describe
 from mlbatch.sensors.ouster.imu import (
@@ -102,17 +101,14 @@ def read_calibration(path: Path, content: bytes) -> OusterCalibration | None:
     return None if document is None else OusterCalibration(parse_metadata(document))
 
 
-class OusterCalibration:
-    """A metadata file; implements `Calibration`."""
-
-    __slots__ = ("_headers", "_reader", "is_shared", "metadata", "model", "path", "serial")
+class OusterCalibration(Calibration):
+    """A metadata file."""
 
     def __init__(self, described: Metadata) -> None:
         self.metadata = described
-        self.path: Path | None = described.path
+        self.path = described.path
         self.model = described.product or f"Ouster {described.layout.beams}-beam"
         self.serial = str(described.serial) if described.serial else ""
-        self.is_shared = False
         # Metadata of another mode are refused by an error that says so.
         self._headers = _headers(described._replace(columns_per_frame=_ANY_IDS))
         table = self._headers.table(_DEFAULT_FRAME_IDS, np.zeros(0, np.int64), 0)
@@ -187,8 +183,8 @@ class OusterCalibration:
         return _FITS_LIDAR_PORT * on_port + _FITS_IMU_PORT * imu_seen
 
 
-class OusterLidar(BaseLidar):
-    """Decoder of one sensor; implements `Lidar`.
+class OusterLidar(Lidar):
+    """Decoder of one sensor.
 
     Beyond the protocol: `lidar_port`, `init_id`. The sequence counts the packets within the column
     window of the metadata, modulo frames x packets per frame; it is negative for packets outside

@@ -29,7 +29,6 @@ from mlbatch.ros.point_packets import (
     WITH_LABELS,
     Layout,
 )
-from mlbatch.sensors.base import BaseLidar
 from mlbatch.sensors.options import check_options
 
 VENDOR = "any"
@@ -73,11 +72,9 @@ def _layout(sample: U8Array) -> Layout | None:
     return layout if known else None
 
 
-class CloudCalibration:
-    """A topic of clouds, which needs no calibration; implements `Calibration`."""
+class CloudCalibration(Calibration):
+    """A topic of clouds, which needs no calibration."""
 
-    path: Path | None = None
-    serial = ""
     is_shared = True
 
     def __init__(self, kind: int) -> None:
@@ -116,8 +113,8 @@ def describe(size: int, sample: U8Array) -> str | None:
     return None if layout is None else f"lidar points of a {KINDS[layout.kind]}, {layout}"
 
 
-class CloudLidar(BaseLidar):
-    """A topic of clouds; implements `Lidar`. Points with labels are in the body frame."""
+class CloudLidar(Lidar):
+    """A topic of clouds. Points with labels are in the body frame."""
 
     sends_twice = False
     typed_by = ""

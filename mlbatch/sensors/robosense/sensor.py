@@ -18,8 +18,7 @@ from mlbatch.arrays import U8Array
 from mlbatch.errors import RigError
 from mlbatch.lidar.geometry import BeamTable, spherical
 from mlbatch.lidar.headers import HeaderReader
-from mlbatch.lidar.interface import NAMED_ONLY, Calibration, Evidence, Recorded, SensorModel
-from mlbatch.sensors.base import BaseLidar
+from mlbatch.lidar.interface import NAMED_ONLY, Calibration, Evidence, Lidar, Recorded, SensorModel
 from mlbatch.sensors.nominal import refuse_other_beams
 from mlbatch.sensors.options import check_options
 from mlbatch.sensors.packet_bytes import majority
@@ -99,19 +98,16 @@ def read_calibration(path: Path, content: bytes) -> CsvCalibration | None:
     return None if angles is None else CsvCalibration(path, angles)
 
 
-class DifopCalibration:
-    """A model with angles from its device packets; implements `Calibration`."""
+class DifopCalibration(Calibration):
+    """A model with angles from its device packets."""
 
-    __slots__ = ("_is_named", "_row", "is_shared", "model", "path", "serial")
+    is_shared = True
 
     def __init__(self, row: Model, *, is_named: bool = False) -> None:
         """is_named: the rig names this model."""
         self._row = row
         self._is_named = is_named
-        self.path: Path | None = None
         self.model = row.name
-        self.serial = ""
-        self.is_shared = True
 
     def for_model(self, name: str) -> DifopCalibration | None:
         """The same calibration if the rig names this model; packets may fit two models."""
@@ -160,22 +156,18 @@ class DifopCalibration:
         return lidar
 
 
-class CsvCalibration:
-    """Csv file with the angles of one unit; implements `Calibration`.
+class CsvCalibration(Calibration):
+    """Csv file with the angles of one unit.
 
     named: the model named in the rig.
     """
 
-    __slots__ = ("_angles", "_named", "is_shared", "model", "path", "serial")
-
     def __init__(self, path: Path, angles: Angles, named: Model | None = None) -> None:
         self._angles = angles
         self._named = named
-        self.path: Path | None = path
+        self.path = path
         lines = f"{VENDOR} {len(angles.elevation_deg)}-line"
         self.model = lines if named is None else named.name
-        self.serial = ""
-        self.is_shared = False
 
     def for_model(self, name: str) -> CsvCalibration | None:
         """The same file for a model of as many channels, named in the rig."""
@@ -228,8 +220,8 @@ class CsvCalibration:
 BUILT_IN: tuple[Calibration, ...] = tuple(DifopCalibration(row) for row in ROWS)
 
 
-class RobosenseLidar(BaseLidar):
-    """Decoder of one sensor; implements `Lidar`.
+class RobosenseLidar(Lidar):
+    """Decoder of one sensor.
 
     Dual mode of 128-line models: three blocks per packet do not divide by two, so each return is a
     separate column (`returns` 1) of unknown return type; the two returns of a shot may be in two

@@ -13,8 +13,7 @@ import numpy as np
 from mlbatch.arrays import BoolArray, F64Array, I64Array, U8Array
 from mlbatch.lidar.geometry import CorrectedRanges
 from mlbatch.lidar.headers import HeaderReader, PacedBlocks
-from mlbatch.lidar.interface import PixelTable, readings
-from mlbatch.sensors.base import BaseLidar
+from mlbatch.lidar.interface import Lidar, PixelTable, readings
 from mlbatch.sensors.packet_bytes import block_azimuths
 from mlbatch.sensors.velodyne.calibration import VelodyneFile
 from mlbatch.sensors.velodyne.clock import HOUR_NS
@@ -76,8 +75,8 @@ class Options:
     stamp_is_end: bool = False
 
 
-class VelodyneLidar(BaseLidar):
-    """Decoder of one sensor; implements `Lidar`."""
+class VelodyneLidar(Lidar):
+    """Decoder of one sensor."""
 
     def __init__(
         self,

@@ -77,14 +77,15 @@ MODELS: tuple[SensorModel, ...] = tuple(
 )
 
 
-class VelodyneCalibration:
-    """Built-in table of a model, or a file that replaces it; implements `Calibration`.
+class VelodyneCalibration(Calibration):
+    """Built-in table of a model, or a file that replaces it.
 
     is_guessed: packets and file fit several models.
     is_named: the rig names this model.
     """
 
-    __slots__ = ("file", "is_guessed", "is_named", "is_shared", "model", "path", "row", "serial")
+    # Neither packets nor files have serial numbers.
+    is_shared = True
 
     def __init__(
         self,
@@ -98,11 +99,8 @@ class VelodyneCalibration:
         self.file = file
         self.is_guessed = is_guessed
         self.is_named = is_named
-        self.path: Path | None = None if file is None else file.path
+        self.path = None if file is None else file.path
         self.model = row.name
-        # Neither packets nor files have serial numbers.
-        self.serial = ""
-        self.is_shared = True
 
     def for_model(self, name: str) -> VelodyneCalibration | None:
         """The same calibration for the model named in the rig; None if it has other beams."""
