@@ -111,6 +111,7 @@ SECONDS = (
     "discovery/test_gravity.py::test_poses",
     "discovery/test_kind_filter.py",
     "discovery/test_match.py",
+    "examples/test_notebook.py",
     "faults/test_laws.py",
     "motion/test_estimate.py",
     "native/test_library.py::test_a_library_of_another_version",
