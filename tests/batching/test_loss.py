@@ -305,6 +305,14 @@ def test_packets_that_come_out_of_order_are_not_lost() -> None:
     assert counted(FULL, packets.take(np.array([0, 2, 1, 3, 6, 5, 7]))) == (1, 2)
 
 
+def test_a_packet_may_come_one_and_a_half_seconds_late() -> None:
+    """Later ones show a clock that was set."""
+    half_ms = Rotor(columns=10, column_ns=50_000.0)
+    packets = sent(half_ms, 3010)
+    order = np.array([0, *range(2, 3002), 1, *range(3002, 3010)])
+    assert counted(half_ms, packets.take(order)) == (0, 1)
+
+
 # -- clocks ---------------------------------------------------------------------------------------
 
 

@@ -232,3 +232,26 @@ def test_topics_of_clouds_are_recognised_by_type() -> None:
         Topic("/d", CLOUD, "json"),
     )
     assert [topic.name for topic in cloud_topics(topics)] == ["/a", "/c"]
+
+
+# Name, header stamps, frame: made from the clouds of /top/points, where they have its stamps in its
+# namespace or frame.
+@pytest.mark.parametrize(
+    ("name", "stamps_ns", "frame", "stays"),
+    [
+        ("/top/rings", {5, 7}, "elsewhere", False),
+        ("/merged/points", {5}, "top", False),
+        ("/merged/points", {5}, "elsewhere", True),
+        ("/topmost/points", {5}, "elsewhere", True),
+        ("/top/rings", {6}, "top", True),
+    ],
+)
+def test_copies_of_a_topic_of_the_rig(
+    name: str, stamps_ns: set[int], frame: str, stays: bool
+) -> None:
+    clouds = CloudTopics(tuple(Topic(one, CLOUD, "cdr") for one in ("/top/points", name)))
+    for topic, seen_ns, seen in (("/top/points", {4, 5}, "top"), (name, stamps_ns, frame)):
+        clouds.stamps_ns[topic] |= seen_ns
+        clouds.lidars[topic].frames.add(seen)
+    clouds.leave_out_copies({"/top/points"})
+    assert [topic.name for topic in clouds.topics] == ["/top/points", name][: 1 + stays]
