@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 # Of a lidar in a window, until surfaces match and then; of more, every second column is read, or
 # every third.
-_SLOTS, _MORE_SLOTS = 1 << 14, 1 << 15
+_SLOTS, _MORE_SLOTS = 1 << 13, 1 << 15
 # Points (n, 3) of a lidar in a window or slice, and their stamps (n,).
 _Points: TypeAlias = tuple[F64Array, I64Array]
 # Nearer points are of the machine, farther ones too sparse to show surfaces.

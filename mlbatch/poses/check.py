@@ -212,20 +212,17 @@ class PoseComparison:
         self._end_place()
         place = [*first, *second]
         self._joined = None
-        self._places.append(self._used(place))
-        surfaces += self._planes(second, state)
-        self._rows.append(self._matched(self._places[-1], state, surfaces))
         self._state.twists = np.vstack([self._state.twists, state.twists])
-        across = _across(self._rows[-1])
-        if across <= _CHANCE:
+        self._places.append(self._used(place))
+        self._match(surfaces + self._planes(second, state))
+        if self._joined is None:
             # Nothing is in common; stems would add nothing either.
             return
-        self._joined = self._estimate()
+        across = _across(self._rows[-1])
         if self._joined.weak >= _WEAK and not self._needs_stems:
             self._needs_stems = True
             self._places[-1] = self._used(place)
-            self._rows[-1] = self._matched(self._places[-1], state)
-            self._joined = self._estimate()
+            self._match()
         self._needs_all |= across < _FEW_SURFACES
         self.needs_more = not self._are_clear(self._measured())
 
@@ -257,32 +254,34 @@ class PoseComparison:
         """How surfaces are matched, and which size of cells is counted."""
         return _RICH if self._needs_all else _LIGHT
 
-    def _matched(
-        self, place: Place, state: State, surfaces: Sequence[Sequence[Planes]] | None = None
-    ) -> Rows:
-        """Match the surfaces of a place, with a motion that is put into the state.
+    def _match(self, surfaces: Sequence[Sequence[Planes]] | None = None) -> None:
+        """Match the surfaces of the last place with its motion, and estimate with all places.
 
-        surfaces: by that motion, if they are known.
+        surfaces: by the motion so far, if they are known.
         """
-        problem = Problem([place], len(self._names))
+        problem = Problem(self._places[-1:], len(self._names))
         level = self._level[0]
-        for _ in range(_MOST_MATCHES):
+        for left in reversed(range(_MOST_MATCHES)):
+            state = replace(self._state, twists=self._state.twists[-1:])
             rows = problem.place_rows(0, state, level, surfaces or problem.planes(0, state, level))
+            self._rows[len(self._places) - 1 :] = [rows]
             if _across(rows) <= _CHANCE:
+                return
+            solution = self._solved()
+            twist = solution.state.twists[-1]
+            step_m = float(np.abs(twist - state.twists).max()) * _BETWEEN_S
+            if not left or step_m <= _FAST_M:
                 break
-            twists = estimate(problem, [rows], state).state.twists
-            if float(np.abs(twists - state.twists).max(initial=0.0)) * _BETWEEN_S <= _FAST_M:
-                break
-            state.twists, surfaces = twists, None
-        return rows
+            self._state.twists[-1], surfaces = twist, None
+        self._joined = _estimate(solution)
 
-    def _estimate(self, without: int | None = None) -> _Estimate:
+    def _solved(self, without: int | None = None) -> Solution:
         """The corrections by all places, or by all but one."""
         used = [number for number in range(len(self._rows)) if number != without]
         state = replace(self._state, twists=self._state.twists[used])
         rows = [self._rows[number] for number in used]
         problem = Problem([], len(self._names))
-        return _estimate(estimate(problem, rows, state, most_sigma_m=_MOST_SIGMA_M))
+        return estimate(problem, rows, state, most_sigma_m=_MOST_SIGMA_M)
 
     def figures(self) -> tuple[PairFigures, ...]:
         """What is known of each pair."""
@@ -304,7 +303,7 @@ class PoseComparison:
             self._state = solve(problem, self._state, _COARSE, _STEPS).state
         self._state = solve(problem, self._state, level, _STEPS).state
         self._rows = problem.rows(self._state, level)
-        self._joined = self._estimate()
+        self._joined = _estimate(self._solved())
 
     def _with_cause(self, key: tuple[int, int], pair: PairFigures) -> PairFigures:
         """Figures with the mistake that explains them, if one does."""
@@ -351,7 +350,7 @@ class PoseComparison:
 
     def _measured(self) -> tuple[PairFigures, ...]:
         if self._joined is None and self._rows:
-            self._joined = self._estimate()
+            self._joined = _estimate(self._solved())
         return tuple(map(self._figures, self._pairs, self._shared))
 
     def _are_clear(self, pairs: Sequence[PairFigures]) -> bool:
@@ -445,7 +444,7 @@ class PoseComparison:
         if len(self._rows) < _LEAST_PLACES:
             return False
         for number in range(len(self._rows)):
-            rest = self._estimate(number)
+            rest = _estimate(self._solved(number))
             if float(along @ rest.covariance @ along) > (2 * most) ** 2:
                 return False
             if float(along @ rest.value) < limit / 2:
