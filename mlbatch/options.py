@@ -244,8 +244,8 @@ CONVERT: Final = (
         "format",
         TEXT,
         "Output",
-        "mcap, npz, ply, pcd, las, laz, kitti, nuscenes, rosbag1, rosbag2.  [default: by "
-        "OUTPUT; a folder: npz]",
+        "mcap, npz, webdataset, ply, pcd, las, laz, kitti, nuscenes, rosbag1, rosbag2.  [default: "
+        "by OUTPUT; a folder: npz]",
         flags=("-f",),
         metavar="FORMAT",
     ),

@@ -33,6 +33,7 @@ from typing import Any, NoReturn
 from mlbatch.cli import main as mlbatch
 from mlbatch.pipeline.run import _Output
 from mlbatch.simulate.ouster.encode import OusterSpec
+from mlbatch.writers.formats import webdataset
 from tests.builders.bags import Body, Recorded, imu_message, packet_message
 from tests.builders.captures import write_pcap
 from tests.builders.mcaps import write_mcap
@@ -43,6 +44,7 @@ SPEC = OusterSpec(beams=32, columns_per_frame=512, serial=111)
 TWO = ("--identity-extrinsics", "--keep-partial")
 ZSTD = ("--compression", "zstd:1")
 FILES = ("--format", "rosbag2", "--max-bag-duration", "0.2", "--pass", "/chatter")
+TARS = ("--format", "webdataset")
 TOUCHES = frozenset(
     {
         *("write", "writev", "flush", "truncate", "fsync"),
@@ -83,6 +85,9 @@ _ONE_JOB = {
     "npz": Case("session/drive.pcap", "out", TWO),
     "npz shard": Case("session/drive.pcap", "out", (*TWO, "--shard", "2/3")),
     "npz split": Case("session/drive.pcap", "out", (*TWO, "--split", "--slices", "2")),
+    "webdataset": Case("session/drive.pcap", "out", (*TWO, *TARS)),
+    "webdataset shard": Case("session/drive.pcap", "out", (*TWO, *TARS, "--shard", "2/3")),
+    "webdataset split": Case("session/drive.pcap", "out", (*TWO, *TARS, "--split")),
     "ply": Case("session/drive.pcap", "out", (*TWO, "--format", "ply", "--min-range", "4.1")),
     "jumps": Case("jumps/drive.pcap", "out.mcap", ("--on-jump", "split", "--keep-partial")),
 }
@@ -194,6 +199,8 @@ def _convert(folder: Path, words: list[str], end: End) -> NoReturn:
         os.dup2(said.fileno(), 2)
     faulthandler.enable(2)
     sys.argv = ["mlbatch", *words]
+    # Few windows of a session are several files.
+    webdataset.WINDOWS_PER_FILE = 2
     calls = 0
     begun = False
     signal.signal(signal.SIGINT, signal.default_int_handler)

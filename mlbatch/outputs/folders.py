@@ -1,9 +1,9 @@
-"""Folders with a file for each scan: index, slice and sensor by name and folder."""
+"""Folders with a file for each scan, or for several: index, slice and sensor by name and folder."""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -19,7 +19,7 @@ _NAME = re.compile(r"(?:(\d{6,})|(head))(?:-(\d+))?", re.ASCII)
 _SHARD = "shard.json"
 # Files with other suffixes are ignored.
 _FIRST, _SECOND = ".pcd.bin", ".time.bin"
-_OUTPUTS = (".npz", ".ply", ".pcd", ".las", ".laz", ".bin", ".partial", ".mcap", ".bag")
+_OUTPUTS = (".npz", ".ply", ".pcd", ".las", ".laz", ".bin", ".tar", ".partial", ".mcap", ".bag")
 
 
 @dataclass(slots=True)
@@ -57,7 +57,7 @@ class ScanFile:
             name += f"-{part}"
         if self.is_only:
             return
-        log.equal("names", self.where, name + self.suffix, self.path.name)
+        log.equal("names", self.where, name + self.suffix, self.where.rpartition("/")[2])
 
     def sensor_index(self, log: CheckLog, sensors: tuple[str, ...]) -> int | None:
         """Index of the sensor of the folder; None without `--split`."""
@@ -119,10 +119,16 @@ def refuse_shard(folder: Path) -> None:
         )
 
 
-def scan_files(log: CheckLog, folder: Path, suffix: str) -> list[ScanFile]:
+def scan_files(
+    log: CheckLog,
+    folder: Path,
+    suffix: str,
+    inside: Callable[[CheckLog, ScanFile], Iterator[ScanFile]] | None = None,
+) -> list[ScanFile]:
     """All files of scans, sorted by sensor and time; unexpected names are violations.
 
-    folder: or the only scan of an output, whose index and slice are in the table next to it.
+    folder: or the only scan of an output, whose index and slice are in the table next to it;
+    inside: gives the files in a file of several scans.
     """
     if folder.is_file():
         return [_only_file(folder, suffix)]
@@ -137,6 +143,8 @@ def scan_files(log: CheckLog, folder: Path, suffix: str) -> list[ScanFile]:
         expected = "scans in the folder or in those of sensors"
         log.fail("names", split[0].where, expected, "both")
     files += split
+    if inside is not None:
+        files = [scan for file in files for scan in inside(log, file)]
     if len({file.slice is None for file in files}) > 1:
         log.fail("names", folder.name, "names with or without a slice", "both")
     return sorted(files, key=lambda file: (file.sensor or "", file.index, file.slice or 0))
@@ -166,14 +174,21 @@ def _files_of(log: CheckLog, folder: Path, suffix: str, sensor: str | None) -> I
         # A second file of a scan, which its reader looks for.
         if path.name.endswith(_SECOND) and suffix == _FIRST:
             continue
-        stem = path.name.removesuffix(suffix)
-        name = _NAME.fullmatch(stem)
-        if name is None or stem == path.name:
-            expected = f"an index of six digits or head, perhaps with a slice, and {suffix}"
-            log.fail("names", where, expected, path.name)
-            continue
-        number, head, part = name.groups()
-        index = -1 if head else int(number)
-        if not head and number != f"{index:06d}":
-            log.fail("names", where, f"{index:06d}", number)
-        yield ScanFile(path, where, sensor, index, None if part is None else int(part), suffix)
+        place = place_of(log, where, path.name, suffix)
+        if place is not None:
+            yield ScanFile(path, where, sensor, *place, suffix)
+
+
+def place_of(log: CheckLog, where: str, name: str, suffix: str) -> tuple[int, int | None] | None:
+    """Index and slice by the name of a file; None for another name, which is a violation."""
+    stem = name.removesuffix(suffix)
+    match = _NAME.fullmatch(stem)
+    if match is None or stem == name:
+        expected = f"an index of six digits or head, perhaps with a slice, and {suffix}"
+        log.fail("names", where, expected, name)
+        return None
+    number, head, part = match.groups()
+    index = -1 if head else int(number)
+    if not head and number != f"{index:06d}":
+        log.fail("names", where, f"{index:06d}", number)
+    return index, None if part is None else int(part)

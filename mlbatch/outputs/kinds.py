@@ -5,17 +5,17 @@ Libraries of a format are loaded only for outputs of that format.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
 from mlbatch.bounded import open_file
 from mlbatch.outputs import float_rows as rows
-from mlbatch.outputs import las, npz, pcd, ply
+from mlbatch.outputs import las, npz, pcd, ply, webdataset
 from mlbatch.outputs.commented import commented_limits
 from mlbatch.outputs.damage import CheckLog, VerifyError
-from mlbatch.outputs.folders import ScanReader, entries, refuse_shard
+from mlbatch.outputs.folders import ScanFile, ScanReader, entries, refuse_shard, scan_files
 
 METADATA = "metadata.yaml"
 REPORT = "report.json"
@@ -28,17 +28,37 @@ _RANGES = "ranges to 1 m: beams do not leave from the origin of their sensor"
 
 @dataclass(frozen=True, slots=True)
 class FileFormat:
-    """A format; suffix: of the first file of a scan; limits: as in `Output.verdict`."""
+    """A format; suffix: of the first file of a scan; limits: as in `Output.verdict`.
+
+    inside: of a format whose files have several scans, see `scan_files`.
+    """
 
     name: str
     suffix: str
     reader: Callable[[CheckLog], ScanReader]
     limits: Mapping[str, str]
+    inside: Callable[[CheckLog, ScanFile], Iterator[ScanFile]] | None = None
+
+    def files(self, log: CheckLog, output: Path) -> list[ScanFile]:
+        """The scans of an output, see `scan_files`."""
+        return scan_files(log, output, self.suffix, self.inside)
+
+    def has(self, path: Path) -> bool:
+        """Whether a file has the name of one of its files; archives may have any other name."""
+        stem = path.name.removesuffix(self.suffix)
+        return stem != path.name and (self.inside is None or stem.isdecimal())
 
 
 # In the order in which suffixes are looked for: that of kitti is the end of that of nuscenes.
 FILE_FORMATS = (
     FileFormat("npz", npz.SUFFIX, npz.NpzReader, npz.LIMITS | {"geometry": _RANGES}),
+    FileFormat(
+        "webdataset",
+        webdataset.SUFFIX,
+        webdataset.SampleReader,
+        npz.LIMITS | {"geometry": _RANGES},
+        webdataset.samples,
+    ),
     FileFormat("ply", ply.SUFFIX, ply.PlyReader, commented_limits("PLY")),
     FileFormat("pcd", pcd.SUFFIX, pcd.PcdReader, commented_limits("PCD")),
     FileFormat("las", las.LAS_SUFFIX, las.LasReader, commented_limits("LAS")),
@@ -51,7 +71,7 @@ FILE_FORMATS = (
 def format_of(paths: Collection[Path]) -> FileFormat | None:
     """The format of files; None if there is none of a known one."""
     return next(
-        (one for one in FILE_FORMATS if any(path.name.endswith(one.suffix) for path in paths)),
+        (one for one in FILE_FORMATS if any(map(one.has, paths))),
         None,
     )
 

@@ -19,7 +19,7 @@ from mlbatch.outputs.cloud_messages import CLOUD, read_cloud, stored_scan
 from mlbatch.outputs.containers import Message, MessagePlace
 from mlbatch.outputs.damage import CheckLog, DamageError
 from mlbatch.outputs.encoding import MessageCursor
-from mlbatch.outputs.folders import ScanFile, ScanReader, scan_files
+from mlbatch.outputs.folders import ScanFile, ScanReader
 from mlbatch.outputs.kinds import FileFormat, Kind, format_of, kind_of
 from mlbatch.outputs.metadata import RunMetadata, metadata_of_grid
 from mlbatch.outputs.run_files import PIECES, RunFiles, inner_texts
@@ -68,7 +68,7 @@ def _read(path: Path, kind: Kind, *, by_window: bool) -> Iterator[Scan]:
             scans = scans or MessageScans(path, _run_of_file(log, path, file, source))
             yield from _scans_of_messages(log, file, scans, source.messages())
     elif kind.form is not None:
-        files = scan_files(log, path, kind.form.suffix)
+        files = kind.form.files(log, path)
         if by_window:
             files.sort(key=lambda file: (file.index, file.slice or 0))
         yield from _scans_of_files(path, kind.form, files, log)
@@ -202,7 +202,7 @@ def _scans_of_file(path: Path, found: str) -> Iterator[Scan]:
         # The files of a sensor are in a folder of their own.
         if not RunFiles.of(folder).report.exists() and RunFiles.of(folder.parent).report.exists():
             folder = folder.parent
-        files = [one for one in scan_files(CheckLog(), folder, form.suffix) if one.path == path]
+        files = [one for one in form.files(CheckLog(), folder) if one.path == path]
         if files:
             yield from _scans_of_files(folder, form, files, CheckLog())
             return
@@ -340,7 +340,7 @@ class _IndexedFiles(IndexedScans):
 
     def __init__(self, path: Path, form: FileFormat, report: Path | None) -> None:
         log = CheckLog()
-        self._files = scan_files(log, path, form.suffix)
+        self._files = form.files(log, path)
         run, self._reader, self._frame_id = _run_of_files(path, form, self._files, log, report)
         super().__init__(path, run)
         for file in self._files:

@@ -1,10 +1,10 @@
 """The files of an output: each is whole or absent, and is made by one run.
 
-A file here is what can be made without the others: that of a scan (some formats: two), or one file
-of a bag (`--max-bag-duration`). A run reads and batches everything, since scans depend on packets
-only and this is the fast part; it decodes and writes the files that are due: of its shard
-(`--shard`), and not finished by an interrupted run (`--resume`). An output in one file is made from
-the start.
+A file here is what can be made without the others: that of a scan (some formats: two), one file of
+a bag (`--max-bag-duration`), or one of so many windows (webdataset). A run reads and batches
+everything, since scans depend on packets only and this is the fast part; it decodes and writes the
+files that are due: of its shard (`--shard`), and not finished by an interrupted run (`--resume`).
+An output in one file is made from the start.
 
 `files.jsonl` in the folder under construction names the job, then each file once it is whole: its
 checksums, and what the report needs of its scans. A line has a checksum and depends on no other.
@@ -45,9 +45,9 @@ from mlbatch.writers import (
 from mlbatch.writers.atomic import SCANS_CSV
 from mlbatch.writers.bag_metadata import METADATA
 from mlbatch.writers.base import windows_per_file
-from mlbatch.writers.formats import file_suffixes
+from mlbatch.writers.formats import file_suffixes, windows_of_format
 from mlbatch.writers.output_file import file_crc, write_all
-from mlbatch.writers.scan_folder import scan_name
+from mlbatch.writers.scan_folder import name_of_windows, scan_name
 
 if TYPE_CHECKING:
     from mlbatch.pipeline.conversion import Conversion
@@ -239,9 +239,13 @@ def _files_of_scans(folder: Path, job: Job, name: str) -> Iterator[str]:
     with export_errors(path):
         rows = read_table(read_text(path, MOST_TABLE_BYTES), str(path))
     prefix = "columns_"
+    windows = windows_of_format(name)
     sensors = [one.removeprefix(prefix) for one in rows.dtype.names or () if one.startswith(prefix)]
     for row in rows:
-        stem = scan_name(int(row["index"]), int(row["slice"]), job.slices)
+        if windows:
+            stem = name_of_windows(int(row["index"]), windows)
+        else:
+            stem = scan_name(int(row["index"]), int(row["slice"]), job.slices)
         # A sensor without a column in a window has no file of it.
         folders = [f"{one}/" for one in sensors if row[prefix + one]] if job.split else [""]
         for suffix in file_suffixes(name) or (name,):
@@ -266,7 +270,8 @@ class Files:
         self.identity = job_identity(job, name, options)
         self.total = 0
         self.content = 0
-        self.windows = 0  # in a file of a bag; 0: each scan has files of its own
+        # In a file; 0: each scan has files of its own.
+        self.windows = windows_of_format(name)
         self._segment = str(job.segment)
         self._job = job
         self._target = target
@@ -445,7 +450,7 @@ class Files:
     # -- places -------------------------------------------------------------------------------
 
     def _number(self, index: int, slice_: int) -> int:
-        """Number of the file of a scan; the head is in the first file of a bag.
+        """Number of the file of a scan; the head is in the first file of several windows.
 
         It depends on time alone: not on how packets are read.
         """
@@ -454,7 +459,8 @@ class Files:
         return index * self._job.slices + slice_
 
     def _unit(self, index: int, slice_: int, sensor: int | None) -> Unit:
-        return self._number(index, slice_), None if self.windows else sensor
+        # A bag has all sensors in one file.
+        return self._number(index, slice_), None if self._job.max_bag_s else sensor
 
     def _is_own(self, index: int, slice_: int) -> bool:
         shard = self._job.shard

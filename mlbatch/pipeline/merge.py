@@ -185,7 +185,7 @@ def merge(
     try:
         for part in parts:
             _take_files(part, output.partial, target.name)
-        if parts[0].account.windows:
+        if parts[0].account.format == "rosbag2":
             _describe_bag(parts, output.partial, target.name)
         table = merged_table([_table(part) for part in parts])
         report = _merged_report(parts, command)

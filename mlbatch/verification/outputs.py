@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING
 
 from mlbatch.outputs import npz
 from mlbatch.outputs.damage import CheckLog, DamageError, VerifyError
-from mlbatch.outputs.folders import scan_files
 from mlbatch.outputs.kinds import FileFormat, kind_of
 from mlbatch.outputs.metadata import RunMetadata, metadata_of_grid
 from mlbatch.outputs.run_files import PIECES, TABLE, RunFiles
@@ -86,9 +85,10 @@ def _check_files(form: FileFormat, output: Output) -> Verdict:
     files = ReportFiles.read(log, output.files)
     if not output.files.table.exists():
         log.fail("table", TABLE, "the table of scans", "none")
-    scans = scan_files(log, output.path, form.suffix)
+    scans = form.files(log, output.path)
     if not scans:
-        raise VerifyError(f"{output.path}: expected files of scans, found strange names only")
+        found = log.violations[0] if log.violations else "none"
+        raise VerifyError(f"{output.path}: expected files of scans, found {found}; convert again")
     try:
         own = reader.begin(scans[0])
     except DamageError as err:

@@ -165,7 +165,7 @@ def _refuse_file_name(target: Path, suffix: str) -> None:
     name = format_of_files(suffix.removeprefix("."))
     if name is not None:
         raise UsageError(
-            f"-o {target}: expected a folder, since {name} output is one file per scan, found a "
+            f"-o {target}: expected a folder, since {name} output is a folder of files, found a "
             f"file name; give -o {target.with_suffix('')} --format {name}"
         )
     # A folder may have any name, but a word that is nearly a suffix is one with a mistake.

@@ -153,6 +153,8 @@ class WriterModule(Protocol):
     # `--compression`, and several threads can write at the same time.
     # Optional, only for folders: FILE_SUFFIXES, a tuple with the suffixes of the files of a scan,
     # without the first dot. Without it the suffix is FORMAT.
+    # Optional, only for folders: WINDOWS_PER_FILE, if a file has the scans of several windows: of
+    # so many by their number, whichever of them there are.
     # Optional: record_layout(options: WriterOptions) -> RecordLayout | None, records of points
     # that the writer takes packed (`Scan.packed`). With `--sort points` scans have arrays instead.
 

@@ -43,6 +43,14 @@ def scan_name(index: int, slice_: int, slices: int) -> str:
     return stem if slices == 1 else f"{stem}-{slice_}"
 
 
+def name_of_windows(index: int, windows: int) -> str:
+    """Return the name of the file of so many windows that has this one: that of the first one.
+
+    The head is in the first file.
+    """
+    return scan_name(max(index, 0) // windows * windows, 0, 1)
+
+
 def check_dense(name: str, info: RunInfo) -> None:
     """Refuse organized scans; name: of a format without them."""
     if info.layout == "organized":

@@ -17,7 +17,8 @@ import pytest
 from rosbags.highlevel import AnyReader
 
 from mlbatch.types import Scan
-from mlbatch.writers.formats import npz
+from mlbatch.writers import npz_encoder as npz
+from mlbatch.writers.formats import webdataset
 from mlbatch.writers.output_file import Bytes
 from tests.builders.captures import write_pcap
 from tests.builders.run import command
@@ -100,6 +101,8 @@ FIXTURE_ROWS = [
     ("--format las", 3),
     ("--format kitti", 3),
     ("--format nuscenes --keep-partial", 3),
+    ("--format webdataset --keep-partial", 3),
+    ("--format webdataset --split --slices 2", 2),
     ("--split --slices 2", 3),
     ("--layout organized --keep-partial", 3),
     ("--sort points --slices 3", 3),
@@ -139,8 +142,9 @@ LAW = [
 
 @pytest.mark.parametrize(("words", "count", "mixed"), LAW)
 def test_shards_give_the_bytes_of_one_run(
-    shell: Shell, words: str, count: int, mixed: bool
+    shell: Shell, words: str, count: int, mixed: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr(webdataset, "WINDOWS_PER_FILE", 2)
     if words.startswith(MESSAGES):
         write_recordings(Path(), turns=9)
     if words.startswith(PACKETS):

@@ -26,6 +26,7 @@ _FORMS = {
     "mcap lz4": ("mcap", "lz4.mcap", "lz4"),
     "mcap zstd": ("mcap", "zstd.mcap", "zstd:1"),
     "npz": ("npz", "n", "none"),
+    "webdataset": ("webdataset", "w", "none"),
     "ply": ("ply", "p", "none"),
     "pcd": ("pcd", "c", "none"),
     "las": ("las", "l", "none"),

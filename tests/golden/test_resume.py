@@ -16,7 +16,7 @@ import pytest
 from tests.builders.sessions import REPOSITORY
 from tests.resume_storm import CASES, contents, write_recordings
 
-KILLS = 18
+KILLS = 21
 SEED = 3
 LIMITED = """
 import resource, sys

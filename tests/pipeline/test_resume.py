@@ -27,7 +27,8 @@ from mlbatch.pipeline import output as pipeline_output
 from mlbatch.readers import source
 from mlbatch.types import Scan
 from mlbatch.writers import atomic
-from mlbatch.writers.formats import npz
+from mlbatch.writers import npz_encoder as npz
+from mlbatch.writers.formats import webdataset
 from mlbatch.writers.output_file import Bytes
 from tests.builders.run import command
 from tests.builders.sessions import FIXTURE, SMALL, Shell, Unit, recording_shell, write_session
@@ -236,14 +237,16 @@ def test_an_interrupt_in_a_finalizer_is_not_lost(
         ("--slices 2", "000003-1.npz", "table"),
         ("--keep-partial", "head.npz", "table"),
         ("--format nuscenes", "000003.time.bin", "container"),
+        ("--format webdataset --split", "left/000002.tar", "table"),
         ("--format rosbag2", "out_0.mcap", ""),
         ("--format rosbag2 --max-bag-duration 0.2", "out_1.mcap", "names"),
         ("", "scans.csv", "table"),
     ],
 )
 def test_a_file_missing_in_a_complete_output_is_named(
-    shell: Shell, words: str, name: str, fault: str
+    shell: Shell, words: str, name: str, fault: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr(webdataset, "WINDOWS_PER_FILE", 2)
     shell(f"convert {CAPTURE} {words} -o out")
     assert "is complete" in shell(f"convert {CAPTURE} {words} -o out --resume").err
     Path("out", name).unlink()

@@ -27,8 +27,8 @@ OPTIONS: dict[str, dict[str, Any]] = {
 }
 CASES = [
     *((name, kind, word) for name, kind in FORMATS for word in ("plain", "split")),
-    *((name, kind, "sweeps") for name, kind in FORMATS[:4]),
-    *((name, kind, "head") for name, kind in FORMATS[:4]),
+    *((name, kind, "sweeps") for name, kind in FORMATS[:5]),
+    *((name, kind, "head") for name, kind in FORMATS[:5]),
 ]
 
 

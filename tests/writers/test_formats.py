@@ -160,6 +160,7 @@ def test_overwriting_happens_at_the_end(name: str, tmp_path: Path) -> None:
             "rosbag2": ["metadata.yaml", "out_0.mcap"],
             "kitti": ["000007.bin", "times.txt"],
             "nuscenes": ["000007.pcd.bin", "000007.time.bin", "times.txt"],
+            "webdataset": ["000000.tar"],
         }.get(name, [f"000007.{name}"])
         assert sorted(path.name for path in target.iterdir()) == sorted([*own, "scans.csv"])
 

@@ -71,6 +71,7 @@ def test_suffix_and_option_choose(target: str, asked: str | None, expected: str)
         ("x.mcap", "npz", "leave out .mcap"),
         ("x.pcd", None, "-o x --format pcd"),
         ("x.LAZ", "laz", "-o x --format laz"),
+        ("x.tar", None, "-o x --format webdataset"),
         ("x.bin", None, "-o x --format kitti"),
         ("x.db3", None, "-o x --format rosbag2"),
         ("x.bagg", None, "the nearest is .bag"),
@@ -102,7 +103,7 @@ def test_contents_of_the_formats() -> None:
         assert extras(name, WriterOptions("ouster")) == {
             *("imu", "range_m", "reflectivity", *encodings)
         }
-    for name in ("npz", "ply", "pcd", "las", "laz", "kitti", "nuscenes"):
+    for name in ("npz", "webdataset", "ply", "pcd", "las", "laz", "kitti", "nuscenes"):
         assert not extras(name, WriterOptions()) & {"imu", "cdr", "ros1"}
 
 

@@ -6,7 +6,10 @@ Layouts: the PCD documentation, the LAS specification 1.4, docs/sources/outputs.
 from __future__ import annotations
 
 import io
+import json
+import math
 import struct
+import tarfile
 import zipfile
 from collections.abc import Callable, Mapping
 from dataclasses import replace
@@ -193,6 +196,17 @@ def _npz(folder: Path, number: int) -> Fields:
         return {key: loaded[key] for key in loaded.files}
 
 
+def _tar(folder: Path, number: int) -> Fields:
+    with tarfile.open(folder / "000000.tar") as shard:
+        npz, about = (shard.extractfile(f"{number:06}.{suffix}") for suffix in ("npz", "json"))
+        assert npz is not None
+        assert about is not None
+        with np.load(io.BytesIO(npz.read()), allow_pickle=False) as loaded:
+            fields = {key: loaded[key] for key in loaded.files}
+        assert json.load(about)["points"] == len(fields["xyz"])
+    return fields
+
+
 def _pypcd4(folder: Path, number: int) -> Fields:
     cloud = pypcd4.PointCloud.from_path(folder / f"{number:06}.pcd")
     assert cloud.fields == ("x", "y", "z", "intensity", "time", *LABELS)
@@ -231,6 +245,7 @@ READ: Mapping[str, Callable[[Path, int], Fields]] = {
     "kitti": _rows,
     "nuscenes": _sweep,
     "npz": _npz,
+    "webdataset": _tar,
     "pcd": _pypcd4,
     "ply": _trimesh,
     "cloudcompare": _trimesh,
@@ -261,7 +276,7 @@ def test_other_programs_read_all_points(name: str, tmp_path: Path) -> None:
         # The unit of LAS is 0.1 mm.
         tolerance = 0.5001e-4 if name in ("las", "laz") else 0.0
         np.testing.assert_allclose(fields.pop("xyz"), scan.xyz, rtol=0, atol=tolerance)
-        assert name == "npz" or set(fields) == FIELDS[name]
+        assert name in ("npz", "webdataset") or set(fields) == FIELDS[name]
         for field in ("intensity", "time_ns", "reflectivity", *LABELS):
             if field in fields:
                 np.testing.assert_array_equal(fields[field], getattr(scan, field))
@@ -347,6 +362,53 @@ def test_the_zip_of_npz_is_that_of_zipfile(tmp_path: Path) -> None:
         for name in found.namelist():
             expected.writestr(zipfile.ZipInfo(name), found.read(name))
     assert path.read_bytes() == again.getvalue()
+
+
+# -- webdataset -----------------------------------------------------------------------------------
+
+
+def test_the_tar_is_that_of_tarfile_with_npz_and_json(tmp_path: Path) -> None:
+    """Keys have no dot: WebDataset ends a key there. The fill of a lidar may not be known."""
+    scan = replace(point_scan(), index=499, fill=np.array([math.nan, 0.75], np.float32))
+    later = replace(dense_scan(), index=500, slice=1, info=run_info(slices=2))
+    head = replace(scan, index=-1)
+    folder = written(tmp_path / "out", "webdataset", head, scan, later)
+    assert sorted(one.name for one in folder.iterdir()) == ["000000.tar", "000500.tar", "scans.csv"]
+    found = {}
+    for path in sorted(folder.glob("*.tar")):
+        again = io.BytesIO()
+        with (
+            tarfile.open(path) as read,
+            tarfile.open(fileobj=again, mode="w", format=tarfile.USTAR_FORMAT) as expected,
+        ):
+            for member in read.getmembers():
+                content = read.extractfile(member)
+                assert content is not None
+                found[member.name] = content.read()
+                plain = tarfile.TarInfo(member.name)
+                plain.size = member.size
+                expected.addfile(plain, io.BytesIO(found[member.name]))
+        assert path.read_bytes() == again.getvalue()
+    keys = ("head", "000499", "000500-1")
+    assert list(found) == [f"{key}.{suffix}" for key in keys for suffix in ("npz", "json")]
+    alone = written(tmp_path / "npz", "npz", scan) / "000499.npz"
+    assert found["000499.npz"] == alone.read_bytes()
+    assert json.loads(found["000499.json"]) == {
+        "index": 499,
+        "slice": 0,
+        "start_ns": 1_700_000_000_100_000_000,
+        "end_ns": 1_700_000_000_200_000_000,
+        "points": 1,
+        "columns": 1,
+        "columns_left": 1,
+        "columns_right": 0,
+        "complete": True,
+        "fill_left": None,
+        "fill_right": 0.75,
+        "frame_id": "base_link",
+        "rate_hz": "10",
+        "timescale": "utc",
+    }
 
 
 # -- PLY, LAS, KITTI ------------------------------------------------------------------------------

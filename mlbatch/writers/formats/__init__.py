@@ -60,6 +60,12 @@ def file_suffixes(name: str) -> tuple[str, ...]:
     return suffixes
 
 
+def windows_of_format(name: str) -> int:
+    """Return the number of windows in a file of a format; 0: each scan has files of its own."""
+    windows: int = getattr(format_module(name), "WINDOWS_PER_FILE", 0)
+    return windows
+
+
 def format_module(name: str) -> WriterModule:
     """Return the module of one of the formats."""
     if _is_built_in(name):
