@@ -19,6 +19,7 @@ from mlbatch.errors import RecordingError
 from mlbatch.outputs.read import read
 from mlbatch.outputs.run_files import RunFiles
 from mlbatch.outputs.scan import Scan
+from mlbatch.outputs.stored_scan import POINT_ARRAYS
 from mlbatch.outputs.table import read_table
 from mlbatch.reports.report import parse_report
 
@@ -41,10 +42,7 @@ _GRID = (
     *("rate_hz", "period_ns", "t_init_ns", "slices", "sort"),
     *("stamp", "batching", "batching_times", "deskew_to"),
 )
-POINT_FIELDS = (
-    *("xyz", "intensity", "reflectivity", "range_m", "time_ns", "ring", "return_type"),
-    *("lidar_id", "column"),
-)
+POINT_FIELDS = ("xyz", *POINT_ARRAYS, "column")
 COLUMN_FIELDS = ("column_stamp_ns", "column_lidar_id")
 _DIGITS = 16
 # Places of the four points, as parts of the number of points.

@@ -15,7 +15,7 @@ import numpy as np
 
 from mlbatch.arrays import BoolArray, F64Array, I64Array
 from mlbatch.errors import install_extra
-from mlbatch.outputs.commented import CommentedReader, StoredPoints
+from mlbatch.outputs.commented import CommentedReader, Fields
 from mlbatch.outputs.comments import ScanComments
 from mlbatch.outputs.containers import check_unpacked_size, library_errors
 from mlbatch.outputs.damage import DamageError, VerifyError
@@ -141,25 +141,22 @@ class LasReader(CommentedReader):
 
     __slots__ = ()
 
-    def parse(self, data: bytes) -> tuple[ScanComments, StoredPoints]:
+    def parse(self, data: bytes) -> tuple[ScanComments, Fields]:
         """Comments and points of a file, checked against each other."""
         comments, points, has_reflectivity = _parsed(data)
         time_ns: I64Array = np.asarray(points["time_ns"]).astype(np.int64)
         self._check_times(comments, points, time_ns)
         self._check_fields(comments, points)
         axes = [np.asarray(points[name]) * _SCALE_M for name in "XYZ"]
-        return comments, StoredPoints(
-            xyz=np.stack(axes, axis=-1).astype(np.float32),
-            time_s=None,
-            time_ns=time_ns,
-            ring=np.asarray(points["ring"]),
-            return_type=np.asarray(points["return_type"]),
-            lidar_id=np.clip(
-                np.asarray(points["point_source_id"]).astype(np.int64) - 1, 0, 255
-            ).astype(np.uint8),
-            intensity=np.asarray(points["intensity_f32"]),
-            reflectivity=np.asarray(points["reflectivity"]) if has_reflectivity else None,
-        )
+        source = np.asarray(points["point_source_id"]).astype(np.int64)
+        names = ["ring", "return_type", *["reflectivity"] * has_reflectivity]
+        return comments, {
+            "xyz": np.stack(axes, axis=-1).astype(np.float32),
+            "time_ns": time_ns,
+            "lidar_id": np.clip(source - 1, 0, 255).astype(np.uint8),
+            "intensity": np.asarray(points["intensity_f32"]),
+            **{name: np.asarray(points[name]) for name in names},
+        }
 
     def _check_times(self, comments: ScanComments, points: Any, time_ns: I64Array) -> None:
         """`gps_time` is the time of the clock as GPS time; of UTC before 2017 it is unchecked."""

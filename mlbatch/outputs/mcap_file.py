@@ -107,6 +107,8 @@ class McapFile:
         self._schemas: dict[int, str] = {}
         self._channels: dict[int, tuple[str, str, str]] = {}
         self._counts: Counter[int] = Counter()
+        # Offset and records of the chunk that `message_at` read last.
+        self._last = (0, b"")
         with BoundedFile(path) as file:
             if file.read(min(len(MCAP_MAGIC), file.size)) != MCAP_MAGIC:
                 raise VerifyError(f"{path}: expected an MCAP file, found another; convert again")
@@ -210,15 +212,18 @@ class McapFile:
 
     def message_at(self, log: CheckLog, place: MessagePlace) -> Message | None:
         """One message, None if its chunk is damaged; DamageError if there is none."""
-        with BoundedFile(self._path) as file:
-            chunk = Place(_CHUNK, place.chunk, place.chunk_bytes)
-            raw = _bytes_of(file, chunk)
-        _, record = next(records_of(raw))
-        if not isinstance(record, Chunk):
-            raise DamageError(f"a chunk at byte {place.chunk}", type(record).__name__)
-        data = self._chunk_data(log, chunk, record)
-        if data is None:
-            return None
+        # Messages that follow each other are often of one chunk.
+        if self._last[0] != place.chunk:
+            with BoundedFile(self._path) as file:
+                chunk = Place(_CHUNK, place.chunk, place.chunk_bytes)
+                _, record = next(records_of(_bytes_of(file, chunk)))
+            if not isinstance(record, Chunk):
+                raise DamageError(f"a chunk at byte {place.chunk}", type(record).__name__)
+            whole = self._chunk_data(log, chunk, record)
+            if whole is None:
+                return None
+            self._last = place.chunk, whole
+        data = self._last[1]
         begin = place.offset + _MESSAGE_HEAD.size
         head = data[place.offset : begin]
         if len(head) < _MESSAGE_HEAD.size:

@@ -9,7 +9,7 @@ import math
 from dataclasses import dataclass, field
 from functools import lru_cache
 from io import BytesIO
-from typing import cast
+from typing import Any, cast
 from zipfile import ZIP_DEFLATED, ZIP_STORED, ZipFile, ZipInfo
 
 import numpy as np
@@ -17,28 +17,22 @@ import numpy.typing as npt
 from isal.isal_zlib import crc32
 from numpy.lib.format import read_array_header_1_0, read_magic
 
-from mlbatch.arrays import F32Array, I64Array, U8Array, U16Array, U32Array
+from mlbatch.arrays import I64Array
 from mlbatch.outputs.containers import check_unpacked_size, library_errors
 from mlbatch.outputs.damage import DamageError
 from mlbatch.outputs.folders import ScanFile, ScanReader
 from mlbatch.outputs.metadata import RunMetadata, with_variants
-from mlbatch.outputs.stored_scan import StoredScan
+from mlbatch.outputs.stored_scan import POINT_ARRAYS, StoredScan
 from mlbatch.types import VARIANTS
 
 SUFFIX = ".npz"
 SCHEMA = "mlbatch.scan/1"
-# Keys with a row for each point: type, and shape of the row.
-_POINTS = {
-    "xyz": ("<f4", (3,)),
-    "intensity": ("<f4", ()),
-    "range_m": ("<f4", ()),
-    "time_ns": ("<u4", ()),
-    "ring": ("<u2", ()),
-    "return_type": ("|u1", ()),
-    "lidar_id": ("|u1", ()),
+_OPTIONAL = {"reflectivity": POINT_ARRAYS["reflectivity"]}
+# Keys with a value, or three, for each point.
+_POINTS = {"xyz": "<f4"} | {
+    name: kind for name, kind in POINT_ARRAYS.items() if name not in _OPTIONAL
 }
-_DENSE = {"column": ("<u4", ())}
-_OPTIONAL = {"reflectivity": ("<u2", ())}
+_DENSE = {"column": "<u4"}
 _COLUMNS = {"column_stamp_ns": "<i8", "column_lidar_id": "|u1"}
 _NUMBERS = {
     "start_ns": "<i8",
@@ -145,13 +139,12 @@ class NpzReader(ScanReader):
 
     def _kinds(self, data: dict[str, bytes]) -> dict[str, str]:
         """Types by key; missing keys are damage."""
-        points = _POINTS | ({} if self.organized else _DENSE)
-        required = {key: kind for key, (kind, _) in points.items()}
+        required = _POINTS | ({} if self.organized else _DENSE)
         required |= _COLUMNS | _NUMBERS | _BY_SENSOR
         missing = [key for key in (*required, *_TEXTS) if key not in data]
         if missing:
             raise DamageError("all keys of a scan", f"no {', '.join(missing)}")
-        return required | {key: kind for key, (kind, _) in _OPTIONAL.items()}
+        return required | _OPTIONAL
 
     def _check_shapes(self, file: ScanFile, values: dict[str, Values]) -> bool:
         """Check that point arrays have one shape, column arrays another, and numbers none."""
@@ -159,7 +152,7 @@ class NpzReader(ScanReader):
         axes = 2 if self.organized else 1
         shape = values["time_ns"].shape
         columns = shape[:1] if self.organized else values["column_stamp_ns"].shape[:1]
-        expected = {key: shape + row for key, (_, row) in points.items()}
+        expected = {key: (*shape, 3) if key == "xyz" else shape for key in points}
         expected |= dict.fromkeys(_COLUMNS, columns)
         expected |= dict.fromkeys(_NUMBERS, ())
         expected["fill"] = (len(self.sensors) if file.sensor is None else 1,)
@@ -171,29 +164,17 @@ class NpzReader(ScanReader):
         return fits
 
     def _stored(self, file: ScanFile, values: dict[str, Values]) -> StoredScan:
-        number = {key: int(cast(I64Array, values[key])) for key in _NUMBERS}
-        file.check_name(self.log, number["index"], number["slice"], number["slices"])
+        number: dict[str, Any] = {key: int(cast(I64Array, values[key])) for key in _NUMBERS}
+        file.check_name(self.log, number["index"], number["slice"], number.pop("slices"))
+        names = (*_POINTS, *_OPTIONAL, *_DENSE, *_COLUMNS, *_BY_SENSOR)
+        arrays: dict[str, Any] = {name: values.get(name) for name in names}
+        arrays["time_ns"] = arrays["time_ns"].astype(np.int64)
         return StoredScan(
             where=file.where,
-            start_ns=number["start_ns"],
-            end_ns=number["end_ns"],
-            index=number["index"],
-            slice=number["slice"],
-            complete=bool(number["complete"]),
-            xyz=cast(F32Array, values["xyz"]),
             organized=self.organized,
             sensor=file.sensor_index(self.log, self.sensors),
-            intensity=cast(F32Array, values["intensity"]),
-            reflectivity=cast("U16Array | None", values.get("reflectivity")),
-            range_m=cast(F32Array, values["range_m"]),
-            time_ns=cast(I64Array, values["time_ns"].astype(np.int64)),
-            ring=cast(U16Array, values["ring"]),
-            return_type=cast(U8Array, values["return_type"]),
-            lidar_id=cast(U8Array, values["lidar_id"]),
-            column=cast("U32Array | None", values.get("column")),
-            column_stamp_ns=cast(I64Array, values["column_stamp_ns"]),
-            column_lidar_id=cast(U8Array, values["column_lidar_id"]),
-            fill=cast(F32Array, values["fill"]),
+            **number | {"complete": bool(number["complete"])},
+            **arrays,
         )
 
 

@@ -9,7 +9,7 @@ import re
 
 import numpy as np
 
-from mlbatch.outputs.commented import CommentedReader, StoredPoints
+from mlbatch.outputs.commented import CommentedReader, Fields
 from mlbatch.outputs.comments import ScanComments
 from mlbatch.outputs.damage import DamageError
 
@@ -46,7 +46,7 @@ class PcdReader(CommentedReader):
 
     __slots__ = ()
 
-    def parse(self, data: bytes) -> tuple[ScanComments, StoredPoints]:
+    def parse(self, data: bytes) -> tuple[ScanComments, Fields]:
         """Comments and points of a file; a row of an organized one is a slot."""
         end = data.find(_END, 0, _LONGEST_HEAD)
         if end < 0 or not data.startswith(_HEAD):
@@ -68,16 +68,7 @@ class PcdReader(CommentedReader):
             expected = f"{width} x {height} points of {_POINT.itemsize} bytes"
             raise DamageError(expected, f"{count} points, {len(data) - begin} bytes")
         points = np.frombuffer(data, _POINT, count, begin)
-        organized = height != 1
-        if organized:
+        if height != 1:
             points = points.reshape(height, width).T
-        return ScanComments.of_lines(comments), StoredPoints(
-            xyz=points["xyz"],
-            time_s=points["time"],
-            time_ns=None,
-            ring=points["ring"],
-            return_type=points["return_type"],
-            lidar_id=points["lidar_id"],
-            intensity=points["intensity"],
-            organized=organized,
-        )
+        names = points.dtype.names or ()
+        return ScanComments.of_lines(comments), {name: points[name] for name in names}

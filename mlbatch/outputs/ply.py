@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mlbatch.outputs.commented import CommentedReader, StoredPoints
+from mlbatch.outputs.commented import CommentedReader, Fields
 from mlbatch.outputs.comments import ScanComments
 from mlbatch.outputs.damage import DamageError
 
@@ -66,7 +66,7 @@ class PlyReader(CommentedReader):
 
     __slots__ = ()
 
-    def parse(self, data: bytes) -> tuple[ScanComments, StoredPoints]:
+    def parse(self, data: bytes) -> tuple[ScanComments, Fields]:
         """Comments and vertices of a file."""
         comments, style, vertices, begin = _head(data)
         vertex = style.vertex
@@ -79,15 +79,7 @@ class PlyReader(CommentedReader):
             for name in _STANDARD
             if style.prefix + name in style.properties
         }
-        return comments, StoredPoints(
-            xyz=points["xyz"],
-            time_s=fields["time"],
-            time_ns=None,
-            ring=fields.get("ring"),
-            return_type=fields.get("return_type"),
-            lidar_id=fields.get("lidar_id"),
-            intensity=fields.get("intensity"),
-        )
+        return comments, {"xyz": points["xyz"], **fields}
 
 
 def _head(data: bytes) -> tuple[ScanComments, _Style, int, int]:

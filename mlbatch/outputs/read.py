@@ -16,15 +16,15 @@ import numpy.typing as npt
 from mlbatch.batching.grid import Grid
 from mlbatch.errors import RecordingError, UsageError
 from mlbatch.outputs.cloud_messages import CLOUD, read_cloud, stored_scan
-from mlbatch.outputs.containers import Message, MessagePlace
+from mlbatch.outputs.containers import MessagePlace
 from mlbatch.outputs.damage import CheckLog, DamageError
 from mlbatch.outputs.encoding import MessageCursor
-from mlbatch.outputs.folders import ScanFile, ScanReader
-from mlbatch.outputs.kinds import FileFormat, Kind, format_of, kind_of
+from mlbatch.outputs.folders import ScanFile
+from mlbatch.outputs.kinds import FileFormat, format_of, kind_of
 from mlbatch.outputs.metadata import RunMetadata, metadata_of_grid
 from mlbatch.outputs.run_files import PIECES, RunFiles, inner_texts
 from mlbatch.outputs.scan import Scan
-from mlbatch.outputs.stored_scan import StoredScan
+from mlbatch.outputs.stored_scan import POINT_ARRAYS, StoredScan
 from mlbatch.outputs.table import UNKNOWN, ScanRow, TableOfRun, read_table
 from mlbatch.reports.report import RunReport, report_of
 from mlbatch.types import RunInfo, SensorInfo
@@ -37,51 +37,81 @@ if TYPE_CHECKING:
 Array: TypeAlias = npt.NDArray[Any]
 _PARTIAL = ".partial"
 _COLUMN_ARRAYS = ("column", "column_stamp_ns", "column_lidar_id")
-# Arrays of points, and their types.
-_KINDS = {
-    "intensity": "<f4",
-    "reflectivity": "<u2",
-    "range_m": "<f4",
-    "time_ns": "<u4",
-    "ring": "<u2",
-    "return_type": "u1",
-    "lidar_id": "u1",
-}
 
 
-def read(path: Path, *, by_window: bool = False) -> Iterator[Scan]:
-    """Yield the scans of an output in its order, with `--split` those of each sensor.
+class ScanPlace(NamedTuple):
+    """A scan of an output; sensor: with `--split`; points: -1 if no table has their number."""
 
-    path: a .mcap or .bag file, a folder (files of scans, ROS 2 bag), or one file of a scan;
-    by_window: by time also where sensors have folders. Raises RecordingError where the output is
-    damaged, unfinished or of another program.
+    sensor: str
+    window: int
+    slice: int
+    start_ns: int
+    points: int
+    path: str
+
+
+class IndexedScans:
+    """The scans of an output by number, in its order; files are closed between."""
+
+    def __init__(self, path: Path, run: _Run) -> None:
+        self.path = path
+        self._run = run
+        self.places: list[ScanPlace] = []
+
+    def scan(self, number: int) -> Scan:
+        """Read one scan; RecordingError where it is damaged."""
+        raise NotImplementedError
+
+    def _add(self, path: Path, index: int, part: int, sensor: int | None) -> None:
+        start_ns, points = self._run.start_and_points(index, part, sensor)
+        name = "" if sensor is None else self._run.sensors[sensor]
+        self.places.append(ScanPlace(name, index, part, start_ns, points, str(path)))
+
+
+def open_scans(path: Path, report: Path | None = None) -> IndexedScans:
+    """The scans of an output of `convert`, each of which can be read alone.
+
+    path: a .mcap or .bag file, a folder (files of scans, ROS 2 bag), or one file of a scan; report:
+    its path, None for the usual one. Only the indexes of the output are read. RecordingError for
+    what is damaged, unfinished or of another program.
     """
-    _refuse_partial(path)
-    return _read(path, kind_of(path), by_window=by_window)
-
-
-def _read(path: Path, kind: Kind, *, by_window: bool) -> Iterator[Scan]:
-    log = CheckLog()
-    if kind.name in ("mcap", "rosbag1", "rosbag2"):
-        scans: MessageScans | None = None
-        for file, source in _message_files(log, path, kind.name):
-            scans = scans or MessageScans(path, _run_of_file(log, path, file, source))
-            yield from _scans_of_messages(log, file, scans, source.messages())
-    elif kind.form is not None:
-        files = kind.form.files(log, path)
-        if by_window:
-            files.sort(key=lambda file: (file.index, file.slice or 0))
-        yield from _scans_of_files(path, kind.form, files, log)
-    else:
-        yield from _scans_of_file(path, kind.found)
-
-
-def _refuse_partial(path: Path) -> None:
     if path.name.endswith(_PARTIAL):
         raise RecordingError(
             f"{path}: expected a finished output, found that of an unfinished run; convert again, "
             "or continue it with --resume"
         )
+    kind = kind_of(path)
+    log = CheckLog()
+    if kind.form is not None:
+        return _IndexedFiles(path, kind.form, kind.form.files(log, path), log, report)
+    if kind.name:
+        return _IndexedMessages(path, kind.name, log, report)
+    form = format_of([path])
+    if form is not None and path.is_file():
+        folder = path.parent
+        # The files of a sensor are in a folder of their own.
+        if not RunFiles.of(folder).report.exists() and RunFiles.of(folder.parent).report.exists():
+            folder = folder.parent
+        files = [one for one in form.files(CheckLog(), folder) if one.path == path]
+        if files:
+            return _IndexedFiles(folder, form, files, log, report)
+    raise RecordingError(
+        f"{path}: expected an output of `mlbatch convert` (a .mcap or .bag file, or a folder), "
+        f"found {kind.found}; name one"
+    )
+
+
+def read(path: Path, *, by_window: bool = False) -> Iterator[Scan]:
+    """Yield the scans of an output in its order, with `--split` those of each sensor.
+
+    path: as of `open_scans`; by_window: by time also where sensors have folders. Raises
+    RecordingError where the output is damaged, unfinished or of another program.
+    """
+    scans = open_scans(path)
+    numbers: Iterable[int] = range(len(scans.places))
+    if by_window:
+        numbers = sorted(numbers, key=lambda number: scans.places[number][1:3])
+    return map(scans.scan, numbers)
 
 
 def _refuse_damage(log: CheckLog, path: Path) -> None:
@@ -119,19 +149,14 @@ def _message_files(
 
 
 def _run_of_file(
-    log: CheckLog, output: Path, path: Path, file: McapFile | BagFile, report: Path | None = None
+    log: CheckLog, output: Path, path: Path, file: McapFile | BagFile, report_path: Path | None
 ) -> _Run:
-    """The constants of a run by its first file; report: as of `open_scans`."""
+    """The constants of a run by its first file; report and table may be in the folder."""
     from mlbatch.outputs.rosbag1 import BagFile
 
+    files = RunFiles.of(output, report_path)
     if isinstance(file, BagFile):
-        files = RunFiles.of(path, report)
         return _Run(str(path), RunMetadata(), files.report_text(), files.table_text())
-    return _run_of_mcap(log, output, path, file)
-
-
-def _run_of_mcap(log: CheckLog, output: Path, path: Path, file: McapFile) -> _Run:
-    """The constants of a run in its first file; report and table may be in the folder."""
     grid = file.metadata.get("mlbatch.grid")
     if grid is None:
         raise RecordingError(
@@ -144,170 +169,39 @@ def _run_of_mcap(log: CheckLog, output: Path, path: Path, file: McapFile) -> _Ru
         )
     report, table = inner_texts(file)
     if PIECES in grid:
-        files = RunFiles.of(output)
         report, table = files.report_text(), files.table_text()
     metadata = metadata_of_grid(log, path.name, grid)
     _refuse_damage(log, path)
     return _Run(str(path), metadata, report, table)
 
 
-def _scans_of_messages(
-    log: CheckLog, path: Path, scans: MessageScans, messages: Iterable[Message]
-) -> Iterator[Scan]:
-    for message in messages:
-        _refuse_damage(log, path)
-        scan = scans.scan(message)
-        if scan is not None:
-            yield scan
-    _refuse_damage(log, path)
-
-
-class MessageScans:
-    """The scans in the messages of an output, which come in their order."""
-
-    def __init__(self, path: Path, run: _Run) -> None:
-        self._path = path
-        self._run = run
-        self._read = 0
-        # Topics of scans, with the only sensor of each.
-        self.topics: dict[str, int | None] = {"/points": None}
-        self.topics |= {f"/{name}/points": i for i, name in enumerate(run.sensors)}
-
-    def scan(self, message: Message, number: int | None = None) -> Scan | None:
-        """The scan in a message, None for other messages; number: of the scan, None: the next."""
-        if message.type != CLOUD or message.topic not in self.topics:
-            return None
-        if number is None:
-            number = self._read
-            self._read += 1
-        try:
-            cloud = read_cloud(MessageCursor.of_message(message.data, message.encoding))
-            index, part, start_ns, end_ns = self._run.window_of_message(cloud.stamp_ns, number)
-            cloud = replace(cloud, stamp_ns=start_ns)
-            stored = stored_scan(cloud, message.where, self.topics[message.topic])
-        except DamageError as err:
-            raise RecordingError(f"{self._path}: {message.topic}: {err}; convert again") from err
-        stored.index, stored.slice, stored.end_ns = index, part, end_ns
-        return self._run.scan(stored, cloud.frame_id)
-
-
-# -- a file for each scan -------------------------------------------------------------------------
-
-
-def _scans_of_file(path: Path, found: str) -> Iterator[Scan]:
-    """The scan of one file of a folder."""
-    form = format_of([path])
-    if form is not None and path.is_file():
-        folder = path.parent
-        # The files of a sensor are in a folder of their own.
-        if not RunFiles.of(folder).report.exists() and RunFiles.of(folder.parent).report.exists():
-            folder = folder.parent
-        files = [one for one in form.files(CheckLog(), folder) if one.path == path]
-        if files:
-            yield from _scans_of_files(folder, form, files, CheckLog())
-            return
-    raise _no_output(path, found)
-
-
-def _no_output(path: Path, found: str) -> RecordingError:
-    return RecordingError(
-        f"{path}: expected an output of `mlbatch convert` (a .mcap or .bag file, or a folder), "
-        f"found {found}; name one"
-    )
-
-
-def _scans_of_files(
-    folder: Path, form: FileFormat, files: list[ScanFile], log: CheckLog
-) -> Iterator[Scan]:
-    run, reader, frame_id = _run_of_files(folder, form, files, log)
-    for stored in reader.scans(files):
-        _refuse_damage(log, folder)
-        yield run.scan(stored, frame_id)
-    _refuse_damage(log, folder)
-
-
-def _run_of_files(
-    folder: Path,
-    form: FileFormat,
-    files: list[ScanFile],
-    log: CheckLog,
-    report: Path | None = None,
-) -> tuple[_Run, ScanReader, str]:
-    """The constants of a run, the reader of its files, and the frame of its points."""
-    _refuse_damage(log, folder)
-    reader = form.reader(log)
-    try:
-        metadata = reader.begin(files[0]) if files else RunMetadata()
-    except DamageError as err:
-        raise RecordingError(
-            f"{files[0].path}: {err}; see `mlbatch verify`, and convert again"
-        ) from err
-    _refuse_damage(log, folder)
-    texts = RunFiles.of(folder, report)
-    run = _Run(str(folder), metadata, texts.report_text(), texts.table_text())
-    reader.know(run.metadata)
-    return run, reader, metadata.frame_id or ""
-
-
-# -- scans by number ------------------------------------------------------------------------------
-
-
-class ScanPlace(NamedTuple):
-    """A scan of an output; sensor: with `--split`; points: -1 if no table has their number."""
-
-    sensor: str
-    window: int
-    slice: int
-    start_ns: int
-    points: int
-    path: str
-
-
-class IndexedScans:
-    """The scans of an output by number, in the order of `read`; files are closed between."""
-
-    def __init__(self, path: Path, run: _Run) -> None:
-        self.path = path
-        self._run = run
-        self.places: list[ScanPlace] = []
-
-    def scan(self, number: int) -> Scan:
-        """Read one scan; RecordingError where it is damaged."""
-        raise NotImplementedError
-
-    def _add(self, path: Path, index: int, part: int, sensor: int | None) -> None:
-        start_ns, points = self._run.start_and_points(index, part, sensor)
-        name = "" if sensor is None else self._run.sensors[sensor]
-        self.places.append(ScanPlace(name, index, part, start_ns, points, str(path)))
-
-
 class _IndexedMessages(IndexedScans):
     """An MCAP file, or a bag."""
 
-    def __init__(self, path: Path, kind: str, report: Path | None) -> None:
+    def __init__(self, path: Path, kind: str, log: CheckLog, report: Path | None) -> None:
         from mlbatch.outputs.mcap_file import McapFile
 
-        log = CheckLog()
         self._files: list[McapFile | BagFile] = []
         # Number of the file.
         self._messages: list[tuple[int, MessagePlace]] = []
         for file, source in _message_files(log, path, kind):
             if not self._files:
                 super().__init__(path, _run_of_file(log, path, file, source, report))
-                self._scans = MessageScans(path, self._run)
+                # Topics of scans, with the only sensor of each.
+                self._topics: dict[str, int | None] = {"/points": None}
+                self._topics |= {f"/{name}/points": i for i, name in enumerate(self._run.sensors)}
             if isinstance(source, McapFile):
                 # They have all rows of scans.csv.
                 source.attachments.clear()
-            topics = self._scans.topics
             try:
-                found = source.places(topics)
+                found = source.places(self._topics)
             except DamageError as err:
-                raise RecordingError(f"{file}: {err}; see `mlbatch verify`") from err
+                raise _damaged(file, err) from err
             _refuse_damage(log, path)
             for place in found:
                 number = len(self._messages)
                 index, part, _, _ = self._run.window_of_message(place.log_ns, number)
-                self._add(file, index, part, topics[place.topic])
+                self._add(file, index, part, self._topics[place.topic])
                 self._messages.append((len(self._files), place))
             self._files.append(source)
         expected = self._run.rows
@@ -323,27 +217,51 @@ class _IndexedMessages(IndexedScans):
         file, place = self._messages[number]
         try:
             message = self._files[file].message_at(log, place)
+            _refuse_damage(log, self.path)
+            if message is None or message.type != CLOUD:
+                raise DamageError(f"{CLOUD} in {place.topic}", "another message")
+            cloud = read_cloud(MessageCursor.of_message(message.data, message.encoding))
+            index, part, start_ns, end_ns = self._run.window_of_message(cloud.stamp_ns, number)
+            cloud = replace(cloud, stamp_ns=start_ns)
+            stored = stored_scan(cloud, message.where, self._topics[place.topic])
         except (DamageError, OSError) as err:
-            raise RecordingError(f"{self.path}: {err}; see `mlbatch verify`") from err
-        _refuse_damage(log, self.path)
-        scan = None if message is None else self._scans.scan(message, number)
-        if scan is None:
-            raise RecordingError(
-                f"{self.path}: {place.topic}: expected {CLOUD}, found another message; see "
-                "`mlbatch verify`"
-            )
-        return scan
+            raise _damaged(self.path, err) from err
+        stored.index, stored.slice, stored.end_ns = index, part, end_ns
+        return self._run.scan(stored, cloud.frame_id)
+
+
+def _damaged(path: Path, err: Exception) -> RecordingError:
+    return RecordingError(f"{path}: {err}; see `mlbatch verify`, and convert again")
+
+
+# -- a file for each scan -------------------------------------------------------------------------
 
 
 class _IndexedFiles(IndexedScans):
-    """A folder with a file for each scan."""
+    """A folder with a file for each scan, or some of its files."""
 
-    def __init__(self, path: Path, form: FileFormat, report: Path | None) -> None:
-        log = CheckLog()
-        self._files = form.files(log, path)
-        run, self._reader, self._frame_id = _run_of_files(path, form, self._files, log, report)
+    def __init__(
+        self,
+        path: Path,
+        form: FileFormat,
+        files: list[ScanFile],
+        log: CheckLog,
+        report: Path | None,
+    ) -> None:
+        self._files = files
+        _refuse_damage(log, path)
+        self._reader = form.reader(log)
+        try:
+            metadata = self._reader.begin(files[0]) if files else RunMetadata()
+        except DamageError as err:
+            raise _damaged(files[0].path, err) from err
+        _refuse_damage(log, path)
+        texts = RunFiles.of(path, report)
+        run = _Run(str(path), metadata, texts.report_text(), texts.table_text())
         super().__init__(path, run)
-        for file in self._files:
+        self._reader.know(run.metadata)
+        self._frame_id = metadata.frame_id or ""
+        for file in files:
             sensor = file.sensor_index(log, run.sensors)
             self._add(file.path, file.index, file.slice or 0, sensor)
         _refuse_damage(log, path)
@@ -354,21 +272,6 @@ class _IndexedFiles(IndexedScans):
         stored = list(self._reader.scans([self._files[number]]))
         _refuse_damage(log, self.path)
         return self._run.scan(stored[0], self._frame_id)
-
-
-def open_scans(path: Path, report: Path | None = None) -> IndexedScans:
-    """The scans of an output of `convert`, each of which can be read alone.
-
-    Only the indexes of the output are read; report: its path, None for the usual one.
-    RecordingError for what is none, or unfinished.
-    """
-    _refuse_partial(path)
-    kind = kind_of(path)
-    if kind.form is not None:
-        return _IndexedFiles(path, kind.form, report)
-    if not kind.name:
-        raise _no_output(path, "one file of a folder" if format_of([path]) else kind.found)
-    return _IndexedMessages(path, kind.name, report)
 
 
 # -- scans ----------------------------------------------------------------------------------------
@@ -459,13 +362,16 @@ class _Run:
             )
         arrays = point_arrays(stored)
         has_columns = stored.column_stamp_ns is not None
-        absent = () if has_columns else (*(_KINDS.keys() - arrays.keys()), *_COLUMN_ARRAYS)
+        absent = () if has_columns else (*(POINT_ARRAYS.keys() - arrays.keys()), *_COLUMN_ARRAYS)
         owners = _copied(stored.column_lidar_id, "u1")
         row = row or ScanRow(
             bool(stored.complete),
             tuple(np.bincount(owners, minlength=len(self.sensors)).tolist()) if has_columns else (),
             fill=() if stored.fill is None else tuple(stored.fill.tolist()),
         )
+        empty: dict[str, Any] = {name: np.zeros(0, kind) for name, kind in POINT_ARRAYS.items()}
+        # Those that no sensor may have.
+        empty |= {"reflectivity": None, "range_m": None}
         return Scan(
             info=self._info_of(frame_id, stored.organized),
             index=place[0],
@@ -475,13 +381,7 @@ class _Run:
             complete=row.complete if stored.complete is None else stored.complete,
             ready_host_ns=row.ready_host_ns,
             xyz=_copied(stored.xyz, "<f4"),
-            intensity=arrays.get("intensity", np.zeros(0, np.float32)),
-            reflectivity=arrays.get("reflectivity"),
-            range_m=arrays.get("range_m"),
-            time_ns=arrays.get("time_ns", np.zeros(0, np.uint32)),
-            ring=arrays.get("ring", np.zeros(0, np.uint16)),
-            return_type=arrays.get("return_type", np.zeros(0, np.uint8)),
-            lidar_id=arrays.get("lidar_id", np.zeros(0, np.uint8)),
+            **{name: arrays.get(name, empty[name]) for name in POINT_ARRAYS},
             column=None if stored.column is None else _copied(stored.column, "<u4"),
             column_stamp_ns=_copied(stored.column_stamp_ns, "<i8"),
             column_lidar_id=owners,
@@ -505,7 +405,7 @@ class _Run:
 
 def point_arrays(stored: StoredScan) -> dict[str, Array]:
     """The point arrays that a scan has, each of its own memory."""
-    found: dict[str, Array | None] = {name: getattr(stored, name) for name in _KINDS}
+    found: dict[str, Array | None] = {name: getattr(stored, name) for name in POINT_ARRAYS}
     if found["intensity"] is None:
         found["intensity"] = stored.byte_intensity
     if stored.time_s is not None:
@@ -521,7 +421,9 @@ def point_arrays(stored: StoredScan) -> dict[str, Array]:
     if stored.sensor is not None and found["lidar_id"] is None:
         # All points are of this sensor, whether the layout has a field for it or not.
         found["lidar_id"] = np.full(stored.xyz.shape[:-1], stored.sensor, np.uint8)
-    return {name: _copied(one, _KINDS[name]) for name, one in found.items() if one is not None}
+    return {
+        name: _copied(one, POINT_ARRAYS[name]) for name, one in found.items() if one is not None
+    }
 
 
 def _copied(values: Array | None, kind: str) -> Array:

@@ -22,6 +22,7 @@ from mlbatch.arrays import (
     U32Array,
 )
 from mlbatch.errors import UsageError
+from mlbatch.outputs.stored_scan import POINT_ARRAYS
 from mlbatch.types import RunInfo
 from mlbatch.units import NS_PER_S
 from mlbatch.writers.point_layouts import CLOUD_LAYOUTS, PLY_LAYOUT
@@ -29,16 +30,6 @@ from mlbatch.writers.point_layouts import CLOUD_LAYOUTS, PLY_LAYOUT
 Records: TypeAlias = npt.NDArray[np.void]
 
 _LAYOUTS = CLOUD_LAYOUTS | {PLY_LAYOUT.name: PLY_LAYOUT}
-# Arrays with an entry for each point, as a table has them.
-_POINT_ARRAYS = (
-    "intensity",
-    "reflectivity",
-    "range_m",
-    "time_ns",
-    "ring",
-    "return_type",
-    "lidar_id",
-)
 # Fields that scans of conversions do not have.
 _OF_OUTPUTS = ("absent", "sensor")
 # Arrays from which the fields of a point layout are made; the others are made of `xyz`.
@@ -209,7 +200,7 @@ class Scan:
             fill=np.where(np.arange(len(self.fill)) == number, self.fill, np.float32("nan")),
         )
         found.xyz = self.xyz[mine]
-        for name in _POINT_ARRAYS:
+        for name in POINT_ARRAYS:
             values = getattr(self, name)
             if values is not None and name not in self.absent:
                 setattr(found, name, values[mine])
@@ -268,7 +259,7 @@ class Scan:
         valid = self.is_valid
         x, y, z = (self.xyz[..., axis][valid] for axis in range(3))
         table: dict[str, npt.NDArray[np.generic]] = {"x": x, "y": y, "z": z}
-        for name in _POINT_ARRAYS:
+        for name in POINT_ARRAYS:
             values = getattr(self, name)
             if values is not None and name not in self.absent:
                 table[name] = values[valid]
@@ -318,7 +309,7 @@ class Scan:
         """The same arrays as conversions pass them to writers."""
         names = [one.name for one in fields(self) if one.name not in _OF_OUTPUTS]
         values = {name: getattr(self, name) for name in names}
-        for name in self.absent & set(_POINT_ARRAYS):
+        for name in self.absent & set(POINT_ARRAYS):
             if values[name] is not None:
                 # Not used by the layout, but of the shape of all others.
                 values[name] = np.zeros(self.xyz.shape[:-1], values[name].dtype)

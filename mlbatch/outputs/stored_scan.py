@@ -13,6 +13,16 @@ from mlbatch.arrays import BoolArray, F32Array, F64Array, I64Array, U8Array, U16
 COLUMN_NS = 1_000_000
 
 
+# Arrays with a value for each point, and their types, as users get them: of npz and `Scan`.
+POINT_ARRAYS = {
+    "intensity": "<f4",
+    "reflectivity": "<u2",
+    "range_m": "<f4",
+    "time_ns": "<u4",
+    "ring": "<u2",
+    "return_type": "|u1",
+    "lidar_id": "|u1",
+}
 _NS = 10**9
 # Of damaged times, before they are converted.
 _MOST_S = 4.0

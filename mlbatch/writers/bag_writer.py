@@ -89,9 +89,9 @@ class BagWriter(MessageWriter):
         """Begin the file of the window, if no message has begun it; log_ns: of the first one."""
         self._bag.begin(log_ns)
 
-    def flush(self) -> ScanJob:
-        """Return the job that writes complete chunks, and completes files."""
-        return _BagJob(self._bag, self._output.partial)
+    def start_window(self, index: int) -> None:
+        """Continue with the file of a window. In order."""
+        self._bag.start(index)
 
 
 class FileStages(NamedTuple):
@@ -227,36 +227,16 @@ class _FileEnd:
         self._bag.complete(self._number, self._block, self._container)
 
 
-class _BagJob(ChunkJob):
-    """Writes the chunks that are complete, to the file of its window."""
-
-    def __init__(self, bag: BagFiles, partial: Path) -> None:
-        super().__init__(bag, partial)
-        self._bag = bag
-
-    def start(self, index: int) -> None:
-        self._bag.start(index)
-
-
-class _SkippedJob(ScanJob):
+class _SkippedJob(ChunkJob):
     """Gives a scan of another run its place, and writes what is complete before it."""
 
     def __init__(self, writer: BagWriter, scan: Scan) -> None:
-        self._writer = writer
+        super().__init__(writer)
         self._scan = scan
-        self._chunks = writer.flush()
-
-    def start(self, index: int) -> None:
-        self._chunks.start(index)
+        self._begin_file = writer.begin_file
 
     def append(self) -> None:
         self._writer.place_scan(self._scan)
         # Another run sends its message, which begins the file.
-        self._writer.begin_file(stamp_ns(self._scan))
-        self._chunks.append()
-
-    def compress(self) -> None:
-        self._chunks.compress()
-
-    def commit(self) -> None:
-        self._chunks.commit()
+        self._begin_file(stamp_ns(self._scan))
+        super().append()

@@ -10,6 +10,7 @@ import json
 import struct
 from collections import Counter
 from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Protocol, TypeAlias
 
@@ -160,8 +161,8 @@ class MessageWriter:
         senders = (one for one in info.sensors if one.sensor_from_imu is not None)
         imu = (f"/{sensor.name}/imu" for sensor in senders)
         self._own = frozenset({TF_STATIC, *self._topics.values(), *imu})
-        with export_errors(self._output.partial):
-            self._file = opener(self._output.partial)
+        with self.errors():
+            self.file = opener(self._output.partial)
 
     def write(self, scan: Scan, sensor: int | None = None) -> ScanJob:
         """Return the job that writes a scan as a PointCloud2, after messages that wait for it."""
@@ -169,7 +170,7 @@ class MessageWriter:
 
     def flush(self) -> ScanJob:
         """Return the job that writes complete chunks."""
-        return ChunkJob(self._file, self._output.partial)
+        return ChunkJob(self)
 
     def write_imu(self, samples: ImuSamples) -> None:
         """Write IMU samples at their own timestamps."""
@@ -188,9 +189,9 @@ class MessageWriter:
     def finish(self, summary: Summary, last: Callable[[Path], None] | None = None) -> None:
         """Add metadata, close the file and move it to its final path."""
         output = self._output
-        with export_errors(output.partial):
+        with self.errors():
             self._begin(summary.t_init_ns)
-            self._file.finish(summary, self._grid(summary.t_init_ns))
+            self.file.finish(summary, self._grid(summary.t_init_ns))
         output.sync()
         if last is not None:
             last(output.partial)
@@ -202,10 +203,17 @@ class MessageWriter:
 
     def abandon(self) -> None:
         """Close the file; it has no index and stays under `.partial`."""
-        self._file.abandon()
+        self.file.abandon()
         self._output.close()
 
     # -- for the stages of jobs ---------------------------------------------------------------
+
+    def errors(self) -> AbstractContextManager[None]:
+        """Errors of the file as ExportErrors."""
+        return export_errors(self._output.partial)
+
+    def start_window(self, index: int) -> None:
+        """Prepare for the window of a scan. In order."""
 
     def pack_scan(self, scan: Scan) -> tuple[CloudMessage, memoryview]:
         """Return the message of a scan and the buffer that contains it. Any thread."""
@@ -218,13 +226,13 @@ class MessageWriter:
     ) -> None:
         """Add the message of a scan to its chunk; crc: its CRC-32. In order."""
         self.place_scan(scan)
-        with export_errors(self._output.partial):
+        with self.errors():
             topic = self._topics[sensor]
-            self._file.send(topic, "sensor_msgs/PointCloud2", stamp_ns(scan), message, crc=crc)
+            self.file.send(topic, "sensor_msgs/PointCloud2", stamp_ns(scan), message, crc=crc)
 
     def place_scan(self, scan: Scan) -> None:
         """Write what precedes a scan. In order."""
-        with export_errors(self._output.partial):
+        with self.errors():
             self._begin(stamp_ns(scan))
 
     # -- messages -----------------------------------------------------------------------------
@@ -233,7 +241,7 @@ class MessageWriter:
         return CloudMessage(self._layout, self._info.frame_id, self._wire)
 
     def _send_or_wait(self, item: ImuSamples | Message) -> None:
-        with export_errors(self._output.partial):
+        with self.errors():
             if self._begun:
                 self._send(item)
                 return
@@ -258,19 +266,19 @@ class MessageWriter:
                 stamps += item.stamp_ns.tolist()
         stamp_ns = min(stamps, default=0)
         transforms = static_transforms(self._info, stamp_ns, self._wire)
-        self._file.send(TF_STATIC, TF_TYPE, stamp_ns, transforms, latched=True)
+        self.file.send(TF_STATIC, TF_TYPE, stamp_ns, transforms, latched=True)
         for item in self._waiting:
             self._send(item)
         self._waiting.clear()
 
     def _send(self, item: ImuSamples | Message) -> None:
         if isinstance(item, Message):
-            self._file.forward(item)
+            self.file.forward(item)
             return
         messages = self._imu[item.sensor].of(item)
         topic = f"/{self._info.sensors[item.sensor].name}/imu"
         for stamp_ns, message in zip(item.stamp_ns.tolist(), messages, strict=True):
-            self._file.send(topic, "sensor_msgs/Imu", stamp_ns, message)
+            self.file.send(topic, "sensor_msgs/Imu", stamp_ns, message)
 
     def _grid(self, t_init_ns: int | None) -> dict[str, str]:
         info = self._info
@@ -294,15 +302,18 @@ def stamp_ns(scan: Scan) -> int:
 class ChunkJob(ScanJob):
     """Writes the chunks that are complete at its `append`."""
 
-    def __init__(self, file: MessageFile, partial: Path) -> None:
-        self._file = file
-        self._partial = partial
+    def __init__(self, writer: MessageWriter) -> None:
+        self._writer = writer
         self._chunks: Sequence[PendingChunk] = ()
+
+    def start(self, index: int) -> None:
+        """Begin the window."""
+        self._writer.start_window(index)
 
     def append(self) -> None:
         """Take the chunks."""
-        with export_errors(self._partial):
-            self._chunks = self._file.take_chunks()
+        with self._writer.errors():
+            self._chunks = self._writer.file.take_chunks()
 
     def compress(self) -> None:
         """Compress them."""
@@ -311,36 +322,29 @@ class ChunkJob(ScanJob):
 
     def commit(self) -> None:
         """Write them."""
-        with export_errors(self._partial):
+        with self._writer.errors():
             for chunk in self._chunks:
                 chunk.write()
 
 
-class _CloudJob(ScanJob):
+class _CloudJob(ChunkJob):
     """Writes one scan, and the chunks that are complete with it."""
 
     def __init__(self, writer: MessageWriter, scan: Scan, sensor: int | None) -> None:
-        self._writer = writer
+        super().__init__(writer)
         self._scan = scan
         self._sensor = sensor
-        self._chunks = writer.flush()
 
     def pack(self) -> None:
         self._cloud, self._message = self._writer.pack_scan(self._scan)
         self.checksum = crc32(self._message, 0)
 
-    def start(self, index: int) -> None:
-        self._chunks.start(index)
-
     def append(self) -> None:
         self._writer.send_scan(self._scan, self._sensor, self._message, self.checksum)
-        self._chunks.append()
-
-    def compress(self) -> None:
-        self._chunks.compress()
+        super().append()
 
     def commit(self) -> None:
-        self._chunks.commit()
+        super().commit()
         self._writer.idle.append(self._cloud)
 
 

@@ -35,19 +35,18 @@ class Sent:
 
 # The messages that replace one: none, itself, or several.
 Change = Callable[[Sent], list[Sent]]
-Notes = Callable[[dict[str, dict[str, str]], dict[str, bytes]], None]
+Notes = Callable[[dict[str, Any], dict[str, Any]], object]
 
 
-def _same(sent: Sent) -> list[Sent]:
-    return [sent]
+def mcap(
+    change: Change = lambda sent: [sent],
+    notes: Notes = lambda metadata, files: None,
+    profile: str = "ros2",
+) -> Edit:
+    """Rewrite an MCAP file, or that of a ROS 2 bag, with the reference library.
 
-
-def _no_notes(metadata: dict[str, dict[str, str]], files: dict[str, bytes]) -> None:
-    """Nothing changes."""
-
-
-def mcap(change: Change = _same, notes: Notes = _no_notes, profile: str = "ros2") -> Edit:
-    """Rewrite an MCAP file, or that of a ROS 2 bag, with the reference library."""
+    notes: changes metadata records and attachments.
+    """
 
     def edit(path: Path) -> None:
         (file,) = [*path.glob("*.mcap")] if path.is_dir() else [path]
@@ -147,43 +146,3 @@ def points(layout: str, change: Callable[[Records], None]) -> Change:
         return [replace(sent, data=bytes(data))]
 
     return changed
-
-
-def patched(place: int, form: str, *values: float) -> Change:
-    """Put numbers at a place of a message."""
-
-    def changed(sent: Sent) -> list[Sent]:
-        data = bytearray(sent.data)
-        struct.pack_into(form, data, place, *values)
-        return [replace(sent, data=bytes(data))]
-
-    return changed
-
-
-def gone(sent: Sent) -> list[Sent]:
-    """Leave a message out."""
-    return []
-
-
-def twice(sent: Sent) -> list[Sent]:
-    """A message twice."""
-    return [sent, sent]
-
-
-def later(by_ns: int) -> Change:
-    """Another log time than the header's."""
-    return lambda sent: [replace(sent, log_ns=sent.log_ns + by_ns)]
-
-
-def put(layout: str, name: str, place: int, value: float) -> Change:
-    """Put a value into a field of a point."""
-
-    def change(records: Records) -> None:
-        records[name][place] = value
-
-    return points(layout, change)
-
-
-def on(topic: str) -> Change:
-    """The same message on another topic."""
-    return lambda sent: [replace(sent, topic=topic)]

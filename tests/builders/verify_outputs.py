@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import csv
-import io
-import json
 import shutil
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from functools import cache
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -20,7 +17,7 @@ from tests.builders.run import TWO_LIDARS, command
 
 Values = npt.NDArray[Any]
 Arrays = dict[str, Values]
-Edit = Callable[[Path], None]
+Edit = Callable[[Path], object]
 # Head and three windows of the fixture; near points only, to keep files small.
 COMMON = ("--keep-partial", "--end", "+0.3", "--max-range", "9", "--quiet")
 KINDS: dict[str, tuple[str, ...]] = {
@@ -87,9 +84,6 @@ def damaged(kind: str, folder: Path, edit: Edit) -> Verdict:
     return verify(path)
 
 
-# -- edits ----------------------------------------------------------------------------------------
-
-
 def arrays(name: str, change: Callable[[Arrays], None]) -> Edit:
     """Change arrays of a scan together."""
 
@@ -100,102 +94,3 @@ def arrays(name: str, change: Callable[[Arrays], None]) -> Edit:
         np.savez(folder / name, **found)
 
     return edit
-
-
-def row(line: int, column: str, value: object) -> Edit:
-    """Change a cell of scans.csv; lines are counted from the first scan."""
-
-    def edit(path: Path) -> None:
-        table = _part(path, "scans.csv")
-        table.write_text(with_cell(table.read_text(), line, column, value))
-
-    return edit
-
-
-def report(*path: str | int, to: Any) -> Edit:
-    """Change a value of report.json; `to`: a value, or a function of the old one."""
-
-    def edit(output: Path) -> None:
-        file = _part(output, "report.json")
-        file.write_text(with_value(file.read_text(), path, to))
-
-    return edit
-
-
-def _part(output: Path, name: str) -> Path:
-    return output / name if output.is_dir() else output.with_name(f"{output.name}.{name}")
-
-
-def with_cell(text: str, line: int, column: str, value: object) -> str:
-    """A table with another cell; a function of the old value, or a new one."""
-    rows = list(csv.reader(io.StringIO(text)))
-    where = rows[0].index(column)
-    old = rows[line + 1][where]
-    rows[line + 1][where] = str(value(int(old)) if callable(value) else value)
-    out = io.StringIO()
-    csv.writer(out, lineterminator="\n").writerows(rows)
-    return out.getvalue()
-
-
-def with_value(text: str, path: Sequence[str | int], to: Any) -> str:
-    """A JSON text with another value."""
-    root = json.loads(text)
-    place = root
-    for step in path[:-1]:
-        place = place[step]
-    place[path[-1]] = to(place.get(path[-1])) if callable(to) else to
-    return json.dumps(root)
-
-
-def both(*edits: Edit) -> Edit:
-    """Several edits."""
-
-    def edit(path: Path) -> None:
-        for one in edits:
-            one(path)
-
-    return edit
-
-
-def renamed(old: str, new: str) -> Edit:
-    """Give a file another name."""
-
-    def edit(folder: Path) -> None:
-        (folder / old).rename(folder / new)
-
-    return edit
-
-
-def removed(name: str) -> Edit:
-    """Remove a file."""
-    return lambda folder: (folder / name).unlink()
-
-
-def raw(name: str, change: Callable[[bytearray], bytes | bytearray]) -> Edit:
-    """Change the bytes of a file; an empty name is the output itself."""
-
-    def edit(path: Path) -> None:
-        file = path / name if name else path
-        file.write_bytes(change(bytearray(file.read_bytes())))
-
-    return edit
-
-
-def flipped(place: int) -> Callable[[bytearray], bytearray]:
-    """Another byte at a place."""
-
-    def change(data: bytearray) -> bytearray:
-        data[place] ^= 0x55
-        return data
-
-    return change
-
-
-def text(name: str, old: str, new: str) -> Edit:
-    """Replace the first occurrence of a text in a file."""
-
-    def change(data: bytearray) -> bytes:
-        assert old.encode() in data, old
-        return bytes(data).replace(old.encode(), new.encode(), 1)
-
-    return raw(name, change)

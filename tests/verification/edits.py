@@ -1,55 +1,33 @@
-"""Edits that damage outputs, by their names and words in `damage.txt`."""
+"""Edits that damage outputs, by their names and words in `damage.txt`.
+
+A function with a decorator is the edit of its name: it changes arrays, bytes or messages.
+"""
 
 from __future__ import annotations
 
 import ast
+import csv
 import io
+import json
 import shlex
 import shutil
 import struct
 import warnings
 import zipfile
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from tests.builders.rewritten_outputs import (
-    Change,
-    Notes,
-    Records,
-    Sent,
-    bag,
-    gone,
-    later,
-    mcap,
-    on,
-    only,
-    patched,
-    points,
-    put,
-    twice,
-)
-from tests.builders.verify_outputs import (
-    Arrays,
-    Edit,
-    arrays,
-    both,
-    flipped,
-    raw,
-    removed,
-    renamed,
-    report,
-    row,
-    text,
-    with_cell,
-    with_value,
-)
+from tests.builders.rewritten_outputs import Change, Records, Sent, bag, mcap, only, points
+from tests.builders.verify_outputs import Arrays, Edit, arrays
 
 # Of a PointCloud2 on `base_link`: seconds and nanoseconds.
 STAMP = 4
+EDITS: dict[str, Callable[..., Edit]] = {}
+CHANGES: dict[str, Callable[..., Change]] = {}
 
 
 def edit_of(words: str) -> Edit:
@@ -62,6 +40,16 @@ def _one(words: str) -> Edit:
     return EDITS[name](*values)
 
 
+def both(*edits: Edit) -> Edit:
+    """Several edits."""
+
+    def edit(path: Path) -> None:
+        for one in edits:
+            one(path)
+
+    return edit
+
+
 def _value(word: str) -> Any:
     """A number or literal; anything else is a text."""
     if word in ("nan", "inf"):
@@ -72,75 +60,60 @@ def _value(word: str) -> Any:
         return word
 
 
-def _changed(word: str) -> Any:
-    """A new value, or with a sign a function of the old one."""
-    if word[:1] in ("+", "-"):
-        return lambda old: old + int(word)
-    return _value(word)
+def _changed(old: Any, word: str) -> Any:
+    """A new value, or with a sign a sum with the old one."""
+    return int(old) + int(word) if word[:1] in ("+", "-") else _value(word)
 
 
 # -- npz --------------------------------------------------------------------------------------
 
 
-def be(name: str, key: str, expression: str) -> Edit:
+def of_arrays(change: Callable[..., None]) -> None:
+    """An edit of the arrays of a scan; its words begin with the name of the file."""
+    name = change.__name__.strip("_")
+    EDITS[name] = lambda file, *words: arrays(file, lambda found: change(found, *words))
+
+
+@of_arrays
+def be(found: Arrays, key: str, expression: str) -> None:
     """Replace an array; expression: of the old one, `v`."""
-
-    def change(found: Arrays) -> None:
-        names = {"v": found[key], "nan": np.nan}
-        found[key] = np.array(eval(expression, names))
-
-    return arrays(name, change)
+    found[key] = np.array(eval(expression, {"v": found[key], "nan": np.nan}))
 
 
-def put_at(name: str, key: str, place: str, value: str) -> Edit:
+@of_arrays
+def _set(found: Arrays, key: str, place: str, value: str) -> None:
     """Put a value at a place."""
-
-    def change(found: Arrays) -> None:
-        found[key][_value(place)] = _value(value)
-
-    return arrays(name, change)
+    found[key][_value(place)] = _value(value)
 
 
-def add_at(name: str, key: str, place: str, value: str) -> Edit:
+@of_arrays
+def add(found: Arrays, key: str, place: str, value: str) -> None:
     """Add a value at a place."""
-
-    def change(found: Arrays) -> None:
-        old = found[key][_value(place)]
-        # Differences may be negative.
-        old = old.astype(np.int64) if old.dtype.kind in "iu" else old
-        found[key][_value(place)] = old + _value(value)
-
-    return arrays(name, change)
+    old = found[key][_value(place)]
+    # Differences may be negative.
+    old = old.astype(np.int64) if old.dtype.kind in "iu" else old
+    found[key][_value(place)] = old + _value(value)
 
 
-def swap(name: str, key: str, first: str, second: str) -> Edit:
+@of_arrays
+def swap(found: Arrays, key: str, first: str, second: str) -> None:
     """Exchange two values."""
     pair = [int(first), int(second)]
-
-    def change(found: Arrays) -> None:
-        found[key][pair] = found[key][pair[::-1]]
-
-    return arrays(name, change)
+    found[key][pair] = found[key][pair[::-1]]
 
 
-def without(name: str, key: str) -> Edit:
+@of_arrays
+def without(found: Arrays, key: str) -> None:
     """Remove a key."""
-
-    def change(found: Arrays) -> None:
-        del found[key]
-
-    return arrays(name, change)
+    del found[key]
 
 
-def slot(name: str, which: str, key: str, value: str, axis: str = "...") -> Edit:
+@of_arrays
+def slot(found: Arrays, which: str, key: str, value: str, axis: str = "...") -> None:
     """Put a value into a slot of an organized scan, which is empty or full."""
-
-    def change(found: Arrays) -> None:
-        empty = np.isnan(found["xyz"]).all(axis=2)
-        place = tuple(np.argwhere(empty == (which == "empty"))[5])
-        found[key][place if found[key].ndim == 2 else (*place, _value(axis))] = _value(value)
-
-    return arrays(name, change)
+    empty = np.isnan(found["xyz"]).all(axis=2)
+    place = tuple(np.argwhere(empty == (which == "empty"))[5])
+    found[key][place if found[key].ndim == 2 else (*place, _value(axis))] = _value(value)
 
 
 def _rows_of(found: Arrays) -> list[str]:
@@ -148,100 +121,160 @@ def _rows_of(found: Arrays) -> list[str]:
     return [key for key in found if len(found[key].shape) and len(found[key]) == len(found["ring"])]
 
 
-def drop_column(name: str) -> Edit:
+@of_arrays
+def drop_column(found: Arrays) -> None:
     """Remove the last column and its points."""
-
-    def change(found: Arrays) -> None:
-        last = len(found["column_stamp_ns"]) - 1
-        keep = found["column"] < last
-        for key in _rows_of(found):
-            found[key] = found[key][keep]
-        for key in ("column_stamp_ns", "column_lidar_id"):
-            found[key] = found[key][:last]
-
-    return arrays(name, change)
+    last = len(found["column_stamp_ns"]) - 1
+    keep = found["column"] < last
+    for key in _rows_of(found):
+        found[key] = found[key][keep]
+    for key in ("column_stamp_ns", "column_lidar_id"):
+        found[key] = found[key][:last]
 
 
-def repeat_column(name: str) -> Edit:
+@of_arrays
+def repeat_column(found: Arrays) -> None:
     """Insert a copy of a column with points after it."""
-
-    def change(found: Arrays) -> None:
-        column = int(found["column"][len(found["column"]) // 2])
-        rows = np.flatnonzero(found["column"] == column)
-        found["column"][found["column"] > column] += 1
-        for key in _rows_of(found):
-            copy = found[key][rows] + (1 if key == "column" else 0)
-            found[key] = np.insert(found[key], rows[-1] + 1, copy, axis=0)
-        for key in ("column_stamp_ns", "column_lidar_id"):
-            found[key] = np.insert(found[key], column, found[key][column])
-
-    return arrays(name, change)
+    column = int(found["column"][len(found["column"]) // 2])
+    rows = np.flatnonzero(found["column"] == column)
+    found["column"][found["column"] > column] += 1
+    for key in _rows_of(found):
+        copy = found[key][rows] + (1 if key == "column" else 0)
+        found[key] = np.insert(found[key], rows[-1] + 1, copy, axis=0)
+    for key in ("column_stamp_ns", "column_lidar_id"):
+        found[key] = np.insert(found[key], column, found[key][column])
 
 
-def member(name: str, key: str, data: bytes | str, method: str = "0", size: str = "") -> Edit:
+# -- bytes ------------------------------------------------------------------------------------
+
+
+def of_bytes(change: Callable[..., bytes | bytearray]) -> None:
+    """An edit of the bytes of a file; its words begin with the name, "" is the output itself."""
+
+    def edit_by(file: str, *words: Any) -> Edit:
+        def edit(path: Path) -> None:
+            place = path / file if file else path
+            place.write_bytes(change(bytearray(place.read_bytes()), *words))
+
+        return edit
+
+    EDITS[change.__name__.strip("_")] = edit_by
+
+
+def of_output(change: Callable[..., bytes | bytearray]) -> None:
+    """An edit of the bytes of an output that is a file."""
+    of_bytes(change)
+    of_file = EDITS[change.__name__]
+    EDITS[change.__name__] = lambda *words: of_file("", *words)
+
+
+@of_bytes
+def cut(data: bytearray, size: str) -> bytearray:
+    """Keep the first bytes; a negative number: drop the last ones."""
+    return data[: len(data) // 2 if size == "half" else int(size)]
+
+
+@of_bytes
+def text(data: bytearray, old: str, new: str, ones: str = "0") -> bytes:
+    """Replace the first occurrence of a text; ones: digits after the new one."""
+    before, after = (word.replace("\\n", "\n").replace("\\t", "\t") for word in (old, new))
+    assert before.encode() in data, old
+    return bytes(data).replace(before.encode(), (after + "1" * int(ones)).encode(), 1)
+
+
+@of_bytes
+def flip(data: bytearray, place: str) -> bytearray:
+    """Another byte at a place."""
+    data[int(place)] ^= 0x55
+    return data
+
+
+@of_bytes
+def write(data: bytearray, content: str) -> bytes:
+    """Another content."""
+    return content.encode()
+
+
+@of_bytes
+def zeros(data: bytearray, kept: str, count: str) -> bytearray:
+    """Zeros after the first bytes."""
+    return data[: int(kept)] + bytes(int(count))
+
+
+@of_bytes
+def member(
+    old: bytearray, key: str, data: bytes | str, method: str = "0", size: str = ""
+) -> bytearray:
     """Add a member to the zip; size: declared size, if not the true one."""
-
-    def change(old: bytearray) -> bytearray:
-        file = io.BytesIO(old)
-        with zipfile.ZipFile(file, "a") as archive, warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            archive.writestr(key, data, int(method))
-        new = bytearray(file.getvalue())
-        if size:
-            struct.pack_into("<I", new, new.rindex(b"PK\x01\x02") + 24, int(size))
-        return new
-
-    return raw(name, change)
+    file = io.BytesIO(old)
+    with zipfile.ZipFile(file, "a") as archive, warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        archive.writestr(key, data, int(method))
+    new = bytearray(file.getvalue())
+    if size:
+        struct.pack_into("<I", new, new.rindex(b"PK\x01\x02") + 24, int(size))
+    return new
 
 
 def npy(name: str, descr: str, fortran: str, shape: str) -> Edit:
     """Add an array with this header and 8 bytes of data."""
     head = f"{{'descr': '{descr}', 'fortran_order': {fortran}, 'shape': {shape}, }}".encode()
     data = b"\x93NUMPY\x01\x00" + len(head).to_bytes(2, "little") + head + bytes(8)
-    return member(name, "x.npy", data)
+    return EDITS["member"](name, "x.npy", data)
 
 
-# -- files ------------------------------------------------------------------------------------
+# -- table and report ---------------------------------------------------------------------------
 
 
-def cut(name: str, size: str) -> Edit:
-    """Keep the first bytes; a negative number: drop the last ones."""
-    return raw(name, lambda data: data[: len(data) // 2 if size == "half" else int(size)])
+def _part(output: Path, name: str) -> Path:
+    return output / name if output.is_dir() else output.with_name(f"{output.name}.{name}")
 
 
-def replaced(name: str, old: str, new: str, ones: str = "0") -> Edit:
-    """Replace the first occurrence of a text; ones: digits after the new one."""
-    words = [word.replace("\\n", "\n").replace("\\t", "\t") for word in (old, new)]
-    return text(name, words[0], words[1] + "1" * int(ones))
+def _with_cell(text: str, line: str, column: str, value: str) -> str:
+    """A table with another cell; lines are counted from the first scan."""
+    rows = list(csv.reader(io.StringIO(text)))
+    where = rows[0].index(column)
+    old = rows[int(line) + 1][where]
+    rows[int(line) + 1][where] = str(_changed(old, value)) if value[:1] in ("+", "-") else value
+    out = io.StringIO()
+    csv.writer(out, lineterminator="\n").writerows(rows)
+    return out.getvalue()
 
 
-def copied_over(source: str, target: str) -> Edit:
-    """Copy a file over another."""
-
-    def edit(folder: Path) -> None:
-        shutil.copy(folder / source, folder / target)
-
-    return edit
-
-
-def overwritten(name: str, content: str) -> Edit:
-    """Another content of a file."""
-    return raw(name, lambda data: content.encode())
-
-
-def of_report(path: str, value: str, power: str = "0") -> Edit:
-    """Change a value of report.json; power: of ten, as a factor."""
-    new = _changed(value)
-    return report(*_path(path), to=new * 10 ** int(power) if power != "0" else new)
+def _with_value(text: str, path: str, value: str, power: str = "0") -> str:
+    """A JSON text with another value; power: of ten, as a factor."""
+    root = place = json.loads(text)
+    steps: list[Any]
+    last: Any
+    *steps, last = (int(step) if step.isdecimal() else step for step in path.split("."))
+    for step in steps:
+        place = place[step]
+    old = place[last] if isinstance(place, list) else place.get(last)
+    new = _changed(old, value)
+    place[last] = new * 10 ** int(power) if power != "0" else new
+    return json.dumps(root)
 
 
-def _path(path: str) -> list[str | int]:
-    return [int(step) if step.isdecimal() else step for step in path.split(".")]
+def _of_part(name: str, change: Callable[..., str]) -> Callable[..., Edit]:
+    """An edit of the table, or of the report, in or next to an output."""
+
+    def edit_by(*words: str) -> Edit:
+        def edit(output: Path) -> None:
+            file = _part(output, name)
+            file.write_text(change(file.read_text(), *words))
+
+        return edit
+
+    return edit_by
 
 
-def cell(line: str, column: str, value: str) -> Edit:
-    """Change a cell of scans.csv; lines are counted from the first scan."""
-    return row(int(line), column, _changed(value) if value[:1] in ("+", "-") else value)
+def _inner_report(notes: dict[str, dict[str, str]], path: str, value: str) -> None:
+    record = notes["mlbatch.report"]
+    record["json"] = _with_value(record["json"], path, value)
+
+
+def _inner_cell(files: dict[str, bytes], *words: str) -> None:
+    files["scans.csv"] = _with_cell(files["scans.csv"].decode(), *words).encode()
 
 
 # -- points -----------------------------------------------------------------------------------
@@ -265,19 +298,21 @@ def field(name: str, key: str, place: str, value: str) -> Edit:
     """Put a value into a field of a point."""
     if name.endswith((".las", ".laz")):
         return _las(name, lambda las: _set_dimension(las, key, int(place), _value(value)))
-
-    def change(data: bytearray) -> bytearray:
-        begin, kind = 0, next((kind for end, kind in _ROWS.items() if name.endswith(end)), [])
-        for head, found in _RECORDS.items():
-            if not kind and head in data:
-                begin, kind = data.index(head) + len(head), found
-        np.frombuffer(data, np.dtype(kind), offset=begin)[key][int(place)] = _value(value)
-        return data
-
-    return raw(name, change)
+    return EDITS["record"](name, name, key, place, value)
 
 
-def _las(name: str, change: Callable[[Any], None]) -> Edit:
+@of_bytes
+def record(data: bytearray, name: str, key: str, place: str, value: str) -> bytearray:
+    """Put a value into a field of a point of a record, by the name of the file or its header."""
+    begin, kind = 0, next((kind for end, kind in _ROWS.items() if name.endswith(end)), [])
+    for head, found in _RECORDS.items():
+        if not kind and head in data:
+            begin, kind = data.index(head) + len(head), found
+    np.frombuffer(data, np.dtype(kind), offset=begin)[key][int(place)] = _value(value)
+    return data
+
+
+def _las(name: str, change: Callable[[Any], object]) -> Edit:
     """Change a file by laspy."""
 
     def edit(folder: Path) -> None:
@@ -309,81 +344,82 @@ def _drop_comments(las: Any) -> None:
 def message(topic: str, number: str, name: str, *words: str) -> Edit:
     """Change one message; the file is written anew, so that indexes and checksums fit."""
     change = only(topic, int(number), CHANGES[name](*words))
-
-    def edit(path: Path) -> None:
-        (bag if path.suffix == ".bag" else mcap)(change)(path)
-
-    return edit
+    return lambda path: (bag if path.suffix == ".bag" else mcap)(change)(path)
 
 
-def moved(by_ns: str) -> Change:
+def of_message(change: Callable[..., Sent]) -> None:
+    """A change of a message: to another one."""
+    name = change.__name__.removesuffix("_in")
+    CHANGES[name] = lambda *words: lambda sent: [change(sent, *words)]
+
+
+@of_message
+def later(sent: Sent, by_ns: str) -> Sent:
+    """Another log time than the header's."""
+    return replace(sent, log_ns=sent.log_ns + int(by_ns))
+
+
+@of_message
+def published(sent: Sent, at_ns: str) -> Sent:
+    """Another publish time."""
+    return replace(sent, publish_ns=int(at_ns))
+
+
+@of_message
+def moved(sent: Sent, by_ns: str) -> Sent:
     """Another time, the same in the log and in the header."""
-
-    def change(sent: Sent) -> list[Sent]:
-        data, log_ns = bytearray(sent.data), sent.log_ns + int(by_ns)
-        struct.pack_into("<iI", data, STAMP, *divmod(log_ns, 10**9))
-        return [replace(sent, data=bytes(data), log_ns=log_ns, publish_ns=log_ns)]
-
-    return change
+    data, log_ns = bytearray(sent.data), sent.log_ns + int(by_ns)
+    struct.pack_into("<iI", data, STAMP, *divmod(log_ns, 10**9))
+    return replace(sent, data=bytes(data), log_ns=log_ns, publish_ns=log_ns)
 
 
-def words_in(old: str, new: str) -> Change:
+@of_message
+def words_in(sent: Sent, old: str, new: str) -> Sent:
     """Other words of the same length."""
-    return lambda sent: [replace(sent, data=sent.data.replace(old.encode(), new.encode(), 1))]
+    return replace(sent, data=sent.data.replace(old.encode(), new.encode(), 1))
 
 
-def slot_of_cloud(which: str, name: str, expression: str) -> Change:
+@of_message
+def patched(sent: Sent, place: str, form: str, value: str) -> Sent:
+    """A number at a place."""
+    data = bytearray(sent.data)
+    struct.pack_into(form, data, int(place), _value(value))
+    return replace(sent, data=bytes(data))
+
+
+@of_message
+def shortened(sent: Sent, count: str) -> Sent:
+    """Without the last bytes."""
+    return replace(sent, data=sent.data[: -int(count)])
+
+
+def _put(layout: str, name: str, place: str, value: str) -> Change:
+    """Put a value into a field of a point."""
+
+    def change(records: Records) -> None:
+        records[name][int(place)] = _value(value)
+
+    return points(layout, change)
+
+
+def _slot_of_cloud(which: str, name: str, expression: str) -> Change:
     """Another value in an empty or full slot; expression: of the old one, `v`."""
 
     def change(records: Records) -> None:
         place = np.flatnonzero(np.isnan(records["x"]) == (which == "empty"))[7]
-        values = {"v": records[name][place], "nan": np.nan}
-        records[name][place] = eval(expression, values)
+        records[name][place] = eval(expression, {"v": records[name][place], "nan": np.nan})
 
     return points("standard", change)
 
 
-CHANGES: dict[str, Callable[..., Change]] = {
-    "later": lambda ns: later(int(ns)),
-    "published": lambda ns: lambda sent: [replace(sent, publish_ns=int(ns))],
-    "moved": moved,
-    "twice": lambda: twice,
-    "gone": lambda: gone,
-    "words": words_in,
-    "patched": lambda place, form, value: patched(int(place), form, _value(value)),
-    "shortened": lambda count: lambda sent: [replace(sent, data=sent.data[: -int(count)])],
+CHANGES |= {
+    "twice": lambda: lambda sent: [sent, sent],
+    "gone": lambda: lambda sent: [],
     "as_imu": lambda: lambda sent: [replace(sent, kind="sensor_msgs/msg/Imu")],
-    "on": on,
-    "put": lambda layout, name, place, value: put(layout, name, int(place), _value(value)),
-    "slot": slot_of_cloud,
+    "on": lambda topic: lambda sent: [replace(sent, topic=topic)],
+    "put": _put,
+    "slot": _slot_of_cloud,
 }
-
-
-def _notes(change: Callable[[dict[str, dict[str, str]], dict[str, bytes]], Any]) -> Edit:
-    """Change metadata records and attachments."""
-    notes: Notes = change
-    return mcap(notes=notes)
-
-
-def inner_report(path: str, value: str) -> Edit:
-    """Change the report inside."""
-
-    def change(metadata: dict[str, dict[str, str]], _: dict[str, bytes]) -> None:
-        record = metadata["mlbatch.report"]
-        record["json"] = with_value(record["json"], _path(path), _value(value))
-
-    return _notes(change)
-
-
-def inner_cell(line: str, column: str, value: str) -> Edit:
-    """Change the table inside."""
-
-    def change(_: dict[str, dict[str, str]], files: dict[str, bytes]) -> None:
-        old = files["scans.csv"].decode()
-        files["scans.csv"] = with_cell(old, int(line), column, value).encode()
-
-    return _notes(change)
-
 
 # -- records of containers ----------------------------------------------------------------------
 
@@ -391,8 +427,7 @@ def inner_cell(line: str, column: str, value: str) -> Edit:
 _MAGIC_BYTES, _HEAD, _CHUNK = 8, struct.Struct("<BQ"), struct.Struct("<QQQII")
 
 
-@dataclass(frozen=True, slots=True)
-class Chunk:
+class Chunk(NamedTuple):
     """Where the parts of a chunk begin; size, stored: bytes of its records, and in the file."""
 
     size_at: int
@@ -420,36 +455,36 @@ def first_chunk(data: bytes | bytearray) -> Chunk:
     return Chunk(begin + 16, name_at, name_at + letters + 8, size, stored)
 
 
-def chunk(part: str, change: str = "0") -> Edit:
+def _put_number(data: bytearray, at: int, value: str) -> bytearray:
+    """A number at a place; without one another byte."""
+    if value:
+        struct.pack_into("<I", data, at, int(value))
+    else:
+        data[at] ^= 1
+    return data
+
+
+@of_output
+def chunk(data: bytearray, part: str, change: str = "0") -> bytearray:
     """Change a declared size of the first chunk, or a byte of it."""
-
-    def edit(data: bytearray) -> bytearray:
-        found = first_chunk(data)
-        if part == "size":
-            struct.pack_into("<Q", data, found.size_at, found.size + int(change))
-        elif part == "stored":
-            struct.pack_into("<Q", data, found.stored_at - 8, found.stored + int(change))
-        elif part == "compression":
-            data[found.name_at] ^= 1
-        else:
-            data[found.stored_at + (found.stored // 2 if part == "middle" else 0)] ^= 0xFF
-        return data
-
-    return raw("", edit)
+    found = first_chunk(data)
+    if part == "size":
+        struct.pack_into("<Q", data, found.size_at, found.size + int(change))
+    elif part == "stored":
+        struct.pack_into("<Q", data, found.stored_at - 8, found.stored + int(change))
+    elif part == "compression":
+        data[found.name_at] ^= 1
+    else:
+        data[found.stored_at + (found.stored // 2 if part == "middle" else 0)] ^= 0xFF
+    return data
 
 
-def message_index(place: str, value: str = "") -> Edit:
+@of_output
+def message_index(data: bytearray, place: str, value: str = "") -> bytearray:
     """Change a number of the first message index, or a byte of it."""
-
-    def edit(data: bytearray) -> bytearray:
-        at = next(at for opcode, at in records(data) if opcode == 7) + int(place)
-        if value:
-            struct.pack_into("<I", data, at, int(value))
-        else:
-            data[at] ^= 1
-        return data
-
-    return raw("", edit)
+    return _put_number(
+        data, next(at for opcode, at in records(data) if opcode == 7) + int(place), value
+    )
 
 
 def bag_record(data: bytearray, op: int) -> tuple[int, int, int]:
@@ -464,72 +499,46 @@ def bag_record(data: bytearray, op: int) -> tuple[int, int, int]:
         at = begin + size
 
 
-def bag_number(op: str, part: str, place: str, value: str = "") -> Edit:
+@of_output
+def bag_number(data: bytearray, op: str, part: str, place: str, value: str = "") -> bytearray:
     """Change a number of the first record of a type, or a byte; part: 0 header, 1 data."""
-
-    def edit(data: bytearray) -> bytearray:
-        at = bag_record(data, int(op))[int(part)] + int(place)
-        if value:
-            struct.pack_into("<I", data, at, int(value))
-        else:
-            data[at] ^= 1
-        return data
-
-    return raw("", edit)
+    return _put_number(data, bag_record(data, int(op))[int(part)] + int(place), value)
 
 
-def repeated_index() -> Edit:
+@of_output
+def repeated_index(data: bytearray) -> bytes:
     """Thousands of entries of the index of a bag are one chunk."""
-
-    def edit(data: bytearray) -> bytes:
-        begin, _, end = bag_record(data, 6)
-        count_at = data.index(b"chunk_count=") + 12
-        (count,) = struct.unpack_from("<I", data, count_at)
-        struct.pack_into("<I", data, count_at, count + 5000)
-        return bytes(data) + bytes(data[begin:end]) * 5000
-
-    return raw("", edit)
+    begin, _, end = bag_record(data, 6)
+    count_at = data.index(b"chunk_count=") + 12
+    (count,) = struct.unpack_from("<I", data, count_at)
+    struct.pack_into("<I", data, count_at, count + 5000)
+    return bytes(data) + bytes(data[begin:end]) * 5000
 
 
-def chunk_position() -> Edit:
+@of_output
+def chunk_position(data: bytearray) -> bytearray:
     """The index of a bag names a position inside a chunk."""
-    return raw("", lambda data: flipped(data.index(b"chunk_pos=") + 10)(data))
+    data[data.index(b"chunk_pos=") + 10] ^= 0x55
+    return data
 
 
-EDITS: dict[str, Callable[..., Edit]] = {
-    "be": be,
-    "set": put_at,
-    "add": add_at,
-    "swap": swap,
-    "without": without,
-    "slot": slot,
-    "drop_column": drop_column,
-    "repeat_column": repeat_column,
-    "member": member,
+EDITS |= {
     "npy": npy,
-    "cut": cut,
-    "flip": lambda name, place: raw(name, flipped(int(place))),
-    "text": replaced,
-    "write": overwritten,
-    "zeros": lambda name, kept, count: raw(name, lambda d: d[: int(kept)] + bytes(int(count))),
-    "rename": renamed,
-    "remove": lambda *names: both(*map(removed, names)),
-    "remove_all": lambda: lambda folder: shutil.rmtree(folder),
-    "copy": copied_over,
-    "report": of_report,
-    "cell": cell,
+    "rename": lambda old, new: lambda folder: (folder / old).rename(folder / new),
+    "remove": lambda *names: lambda folder: [(folder / name).unlink() for name in names],
+    "remove_all": lambda: shutil.rmtree,
+    "copy": lambda source, target: lambda folder: shutil.copy(folder / source, folder / target),
+    "report": _of_part("report.json", _with_value),
+    "cell": _of_part("scans.csv", _with_cell),
     "field": field,
     "las_comments": lambda name: _las(name, _drop_comments),
     "las_scale": lambda name: _las(name, lambda las: las.change_scaling(scales=[0.001] * 3)),
     "message": message,
-    "grid": lambda key, value: _notes(lambda notes, _: notes["mlbatch.grid"].update({key: value})),
-    "no_note": lambda name: _notes(lambda notes, files: (notes.pop(name, 0), files.pop(name, 0))),
-    "inner_report": inner_report,
-    "inner_cell": inner_cell,
     "profile": lambda name: mcap(profile=name),
-    "chunk": chunk,
-    "message_index": message_index,
-    "bag_number": bag_number,
-    "repeated_index": repeated_index,
-    "chunk_position": chunk_position,
+    "grid": lambda key, value: mcap(
+        notes=lambda notes, _: notes["mlbatch.grid"].update({key: value})
+    ),
+    "no_note": lambda name: mcap(notes=lambda *notes: [one.pop(name, 0) for one in notes]),
+    "inner_report": lambda *words: mcap(notes=lambda notes, _: _inner_report(notes, *words)),
+    "inner_cell": lambda *words: mcap(notes=lambda _, files: _inner_cell(files, *words)),
 }

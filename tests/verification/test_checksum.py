@@ -17,15 +17,8 @@ from mlbatch.pipeline.decode_pool import Decoded, DecodeTask, DecodeWorker
 from mlbatch.types import Scan
 from mlbatch.verification import verify
 from tests.builders.run import TWO_LIDARS, command
-from tests.builders.verify_outputs import (
-    COMMON,
-    KINDS,
-    both,
-    copied,
-    damaged,
-    made,
-    row,
-)
+from tests.builders.verify_outputs import COMMON, KINDS, copied, damaged, made
+from tests.verification.edits import edit_of
 
 
 def scaled(scan: Scan) -> None:
@@ -153,7 +146,9 @@ def test_an_output_without_a_table_is_not_checkable(tmp_path: Path) -> None:
 
 def test_an_unknown_checksum_is_not_compared(tmp_path: Path) -> None:
     """As of a writer of another package, which gives none."""
-    unknown = both(*(row(line, "checksum", -1) for line in range(4)))
+    text = table_of(made("ply"))
+    sums = [line.split(",")[-2] for line in text.splitlines()[1:]]
+    unknown = edit_of("; ".join(f"text scans.csv ,{one}, ,-1," for one in sums))
     verdict = damaged("ply", tmp_path, unknown)
     assert verdict.ok
     (check,) = [one for one in verdict.checks if one.name == "checksum"]
