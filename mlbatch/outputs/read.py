@@ -19,7 +19,7 @@ from mlbatch.outputs.cloud_messages import CLOUD, read_cloud, stored_scan
 from mlbatch.outputs.containers import MessagePlace
 from mlbatch.outputs.damage import CheckLog, DamageError
 from mlbatch.outputs.encoding import MessageCursor
-from mlbatch.outputs.folders import ScanFile
+from mlbatch.outputs.folders import ScanFile, scan_files
 from mlbatch.outputs.kinds import FileFormat, format_of, kind_of
 from mlbatch.outputs.metadata import RunMetadata, metadata_of_grid
 from mlbatch.outputs.run_files import PIECES, RunFiles, inner_texts
@@ -71,9 +71,9 @@ class IndexedScans:
 def open_scans(path: Path, report: Path | None = None) -> IndexedScans:
     """The scans of an output of `convert`, each of which can be read alone.
 
-    path: a .mcap or .bag file, a folder (files of scans, ROS 2 bag), or one file of a scan; report:
-    its path, None for the usual one. Only the indexes of the output are read. RecordingError for
-    what is damaged, unfinished or of another program.
+    path: a .mcap or .bag file, or a folder (files of scans, ROS 2 bag); report: its path, None for
+    the usual one. Only the indexes of the output are read. RecordingError for what is damaged,
+    unfinished or of another program.
     """
     if path.name.endswith(_PARTIAL):
         raise RecordingError(
@@ -83,31 +83,36 @@ def open_scans(path: Path, report: Path | None = None) -> IndexedScans:
     kind = kind_of(path)
     log = CheckLog()
     if kind.form is not None:
-        return _IndexedFiles(path, kind.form, kind.form.files(log, path), log, report)
+        return _IndexedFiles(path, kind.form, scan_files(log, path, kind.form.suffix), log, report)
     if kind.name:
         return _IndexedMessages(path, kind.name, log, report)
-    form = format_of([path])
-    if form is not None and path.is_file():
-        folder = path.parent
-        # The files of a sensor are in a folder of their own.
-        if not RunFiles.of(folder).report.exists() and RunFiles.of(folder.parent).report.exists():
-            folder = folder.parent
-        files = [one for one in form.files(CheckLog(), folder) if one.path == path]
-        if files:
-            return _IndexedFiles(folder, form, files, log, report)
+    found = "one file of a folder" if format_of([path]) is not None else kind.found
     raise RecordingError(
         f"{path}: expected an output of `mlbatch convert` (a .mcap or .bag file, or a folder), "
-        f"found {kind.found}; name one"
+        f"found {found}; name one"
     )
+
+
+def _file_of_folder(path: Path) -> IndexedScans | None:
+    """The scan in one file of a folder; None for other paths."""
+    form = format_of([path]) if path.is_file() and kind_of(path).form is None else None
+    if form is None:
+        return None
+    folder = path.parent
+    # The files of a sensor are in a folder of their own.
+    if not RunFiles.of(folder).report.exists() and RunFiles.of(folder.parent).report.exists():
+        folder = folder.parent
+    files = [one for one in scan_files(CheckLog(), folder, form.suffix) if one.path == path]
+    return _IndexedFiles(folder, form, files, CheckLog(), None) if files else None
 
 
 def read(path: Path, *, by_window: bool = False) -> Iterator[Scan]:
     """Yield the scans of an output in its order, with `--split` those of each sensor.
 
-    path: as of `open_scans`; by_window: by time also where sensors have folders. Raises
-    RecordingError where the output is damaged, unfinished or of another program.
+    path: as of `open_scans`, or one file of a scan; by_window: by time also where sensors have
+    folders. Raises RecordingError where the output is damaged, unfinished or of another program.
     """
-    scans = open_scans(path)
+    scans = _file_of_folder(path) or open_scans(path)
     numbers: Iterable[int] = range(len(scans.places))
     if by_window:
         numbers = sorted(numbers, key=lambda number: scans.places[number][1:3])

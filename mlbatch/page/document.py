@@ -455,6 +455,7 @@ def _window_data(windows: Windows) -> dict[str, Any]:
     period_ms = (
         int(windows.start_ns[last] - windows.start_ns[0]) / 1e6 / steps if steps else length_ms
     )
+    values = found.values
     return {
         "sensors": windows.sensors,
         "group": found.group,
@@ -462,17 +463,15 @@ def _window_data(windows: Windows) -> dict[str, Any]:
         "first_index": int(windows.index[0]),
         "slices": windows.slices,
         "floors": _FLOORS_MS,
-        "step": _packed(found.step - found.step[0]),
+        "step": _packed(values["step"] - values["step"][0]),
         "count": _packed(found.count),
         "incomplete": _packed(found.incomplete),
-        "points": _scaled(found.points),
-        "span": _scaled(found.span_ms),
-        "delay": _scaled(found.delay_ms - windows.far_ms),
-        "columns": [_packed(column) for column in found.columns.T],
-        "expected": [_packed(column) for column in found.expected.T],
-        "fill": [_scaled(column, 1.0) for column in found.fill.T],
-        "gap": [_scaled(column) for column in found.gap_ms.T],
-        "coverage": [_scaled(column, 1.0) for column in found.coverage.T],
+        "points": _scaled(values["points"]),
+        "span": _scaled(values["span_ms"]),
+        "delay": _scaled(values["delay_ms"] - windows.far_ms),
+        "gap": [_scaled(column) for column in values["gap_ms"].T],
+        **{key: [_packed(one) for one in values[key].T] for key in ("columns", "expected")},
+        **{key: [_scaled(one, 1.0) for one in values[key].T] for key in ("fill", "coverage")},
     }
 
 
@@ -497,9 +496,5 @@ def _scaled(values: F64Array, top: float | None = None) -> dict[str, Any]:
     high = top if top is not None else float(values[known].max())
     step = (high - low) / (_NONE - 1) or 1.0
     words = np.where(known, np.rint((np.where(known, values, low) - low) / step), _NONE)
-    return {"low": low, "step": step, **_words(words)}
-
-
-def _words(words: F64Array) -> dict[str, str]:
-    data = words.astype("<u2").tobytes()
-    return {"type": "u2", "data": base64.b64encode(data).decode()}
+    data = base64.b64encode(words.astype("<u2").tobytes()).decode()
+    return {"low": low, "step": step, "type": "u2", "data": data}

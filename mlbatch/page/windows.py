@@ -50,7 +50,6 @@ class Windows:
     gap_ms: F64Array
     # NaN where the table has none.
     coverage: F64Array
-    overlap: F64Array
 
     def __len__(self) -> int:
         return len(self.index)
@@ -149,7 +148,6 @@ def _windows(cells: Cells, slices: int) -> Windows:
         fill=_fill(columns, expected, estimated, cells.by_sensor("fill_", reals)),
         gap_ms=cells.by_sensor("max_gap_ns_", whole) / NS_PER_MS,
         coverage=cells.by_sensor("coverage_", reals),
-        overlap=cells.by_sensor("overlap_", reals),
     )
 
 
@@ -167,22 +165,15 @@ def _fill(columns: I64Array, expected: I64Array, estimated: BoolArray, known: F6
 
 @dataclass(frozen=True, slots=True)
 class Summary:
-    """Windows as the page stores them, (m,) and (m, s): groups of `group` windows, worst values."""
+    """Windows as the page stores them, (m,) and (m, s): groups of `group` windows.
+
+    values: of `Windows`, by name: the worst, and sums of columns; count, incomplete: windows.
+    """
 
     group: int
-    step: I64Array
-    # Of its windows: number, incomplete ones.
     count: I64Array
     incomplete: I64Array
-    points: F64Array
-    span_ms: F64Array
-    delay_ms: F64Array
-    columns: I64Array
-    expected: I64Array
-    fill: F64Array
-    gap_ms: F64Array
-    coverage: F64Array
-    overlap: F64Array
+    values: dict[str, F64Array]
 
 
 def summarise(windows: Windows) -> Summary:
@@ -192,26 +183,15 @@ def summarise(windows: Windows) -> Summary:
     at = np.arange(0, rows, group)
     count = np.diff(np.append(at, rows))
 
-    def lowest(values: F64Array) -> F64Array:
-        found: F64Array = np.fmin.reduceat(values, at, axis=0)
-        return found
-
-    def highest(values: F64Array) -> F64Array:
-        found: F64Array = np.fmax.reduceat(values, at, axis=0)
-        return found
-
-    return Summary(
-        group=group,
-        step=windows.step[at],
-        count=count,
-        incomplete=np.add.reduceat((~windows.complete).astype(np.int64), at),
-        points=np.add.reduceat(windows.points, at) / count,
-        span_ms=highest(windows.span_ms),
-        delay_ms=highest(windows.delay_ms),
-        columns=np.add.reduceat(windows.columns, at, axis=0),
-        expected=np.add.reduceat(windows.expected, at, axis=0),
-        fill=lowest(windows.fill),
-        gap_ms=highest(windows.gap_ms),
-        coverage=lowest(windows.coverage),
-        overlap=highest(windows.overlap),
-    )
+    values = {
+        name: join.reduceat(getattr(windows, name), at, axis=0)
+        for join, names in (
+            (np.fmin, ("fill", "coverage")),
+            (np.fmax, ("span_ms", "delay_ms", "gap_ms")),
+            (np.add, ("points", "columns", "expected")),
+        )
+        for name in names
+    }
+    values |= {"step": windows.step[at], "points": values["points"] / count}
+    incomplete = np.add.reduceat((~windows.complete).astype(np.int64), at)
+    return Summary(group, count, incomplete, values)

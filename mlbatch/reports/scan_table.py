@@ -11,6 +11,7 @@ from array import array
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
+from operator import add
 from typing import NamedTuple
 
 import numpy as np
@@ -278,27 +279,20 @@ class _Row(NamedTuple):
 
     def joined(self, other: _Row) -> _Row:
         """This row and that of another sensor in the same window."""
-        return _Row(
-            self.key,
-            self.start_ns,
-            self.end_ns,
-            min(self.first_stamp_ns, other.first_stamp_ns),
-            max(self.last_stamp_ns, other.last_stamp_ns),
-            self.points + other.points,
-            tuple(a + b for a, b in zip(self.columns, other.columns, strict=True)),
-            self.complete and other.complete,
-            tuple(max(pair) for pair in zip(self.max_gap_ns, other.max_gap_ns, strict=True)),
-            max(self.ready_host_ns, other.ready_host_ns),
-            tuple(max(pair) for pair in zip(self.coverage, other.coverage, strict=True)),
-            tuple(max(pair) for pair in zip(self.overlap, other.overlap, strict=True)),
-            self.fill,
-            tuple(a + b for a, b in zip(self.points_of, other.points_of, strict=True)),
-            self.is_partial,
+        sums = (self.checksum, other.checksum)
+        return self._replace(
+            first_stamp_ns=min(self.first_stamp_ns, other.first_stamp_ns),
+            last_stamp_ns=max(self.last_stamp_ns, other.last_stamp_ns),
+            points=self.points + other.points,
+            columns=tuple(map(add, self.columns, other.columns)),
+            complete=self.complete and other.complete,
+            max_gap_ns=tuple(map(max, self.max_gap_ns, other.max_gap_ns)),
+            ready_host_ns=max(self.ready_host_ns, other.ready_host_ns),
+            coverage=tuple(map(max, self.coverage, other.coverage)),
+            overlap=tuple(map(max, self.overlap, other.overlap)),
+            points_of=tuple(map(add, self.points_of, other.points_of)),
             # A sum, as readers may have the scans of a window in another order.
-            NO_CHECKSUM
-            if NO_CHECKSUM in (self.checksum, other.checksum)
-            else (self.checksum + other.checksum) % _CHECKSUMS,
-            self.is_listed,
+            checksum=NO_CHECKSUM if NO_CHECKSUM in sums else sum(sums) % _CHECKSUMS,
         )
 
     def places(self) -> str:

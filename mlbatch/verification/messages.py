@@ -7,8 +7,9 @@ from __future__ import annotations
 
 import zlib
 from collections import Counter
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Protocol
 
 import numpy as np
 
@@ -82,6 +83,14 @@ class Transform:
     rotation: F64Array
 
 
+class MessageSource(Protocol):
+    """A file of messages."""
+
+    def messages(self) -> Iterator[Message]:
+        """All messages in the order of the file."""
+        ...
+
+
 # -- topics ---------------------------------------------------------------------------------------
 
 
@@ -113,10 +122,21 @@ class TopicChecks:
         """Whether every sensor has its own topic."""
         return bool(self._split)
 
-    def begin_file(self) -> None:
-        """Call before the messages of a file."""
-        self.files += 1
-        self._is_first = True
+    def check_files(self, files: Iterable[MessageSource], where: str) -> list[int]:
+        """Check all messages of the files of an output, then its sums; the number in each file.
+
+        where: name of the output.
+        """
+        counts = []
+        for file in files:
+            before = self.counts.total()
+            self.files += 1
+            self._is_first = True
+            for message in file.messages():
+                self.check(message)
+            counts.append(self.counts.total() - before)
+        self.finish(where)
+        return counts
 
     def check(self, message: Message) -> None:
         """Check one message, in the order of the files."""

@@ -5,7 +5,7 @@ Libraries of a format are loaded only for outputs of that format.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -22,7 +22,7 @@ from mlbatch.verification.report_checks import ReportFiles
 from mlbatch.verification.verdict import Verdict, outcomes
 
 if TYPE_CHECKING:
-    from mlbatch.verification.indexes import BagFile
+    from mlbatch.outputs.rosbag2 import Yaml
 
 _RANGES = "ranges to 1 m: beams do not leave from the origin of their sensor"
 _NO_REPORT = "no report in or next to the output; give it with --report"
@@ -68,23 +68,38 @@ def check_output(output: Output) -> Verdict:
     kind = kind_of(output.path)
     if kind.form is not None:
         return _check_files(kind.form, output)
-    checks: dict[str, Callable[[Output], Verdict]] = {
-        "mcap": lambda one: _check_mcap(one, [one.path], "mcap"),
-        "rosbag1": _check_bag,
-        "rosbag2": _check_rosbag2,
-    }
-    if kind.name not in checks:
-        raise VerifyError(f"{output.path}: {_FOREIGN}, found {kind.found}; {_NAME_ONE}")
-    return checks[kind.name](output)
+    if kind.name == "mcap":
+        return _check_mcap(output, [output.path], kind.name)
+    if kind.name == "rosbag1":
+        return _check_bag(output)
+    if kind.name == "rosbag2":
+        return _check_rosbag2(output)
+    raise VerifyError(f"{output.path}: {_FOREIGN}, found {kind.found}; {_NAME_ONE}")
+
+
+def _side_files(output: Output) -> ReportFiles:
+    """The report and the table, which has to be there."""
+    files = ReportFiles.read(output.log, output.files)
+    if not output.files.table.exists():
+        output.log.fail("table", TABLE, "the table of scans", "none")
+    return files
+
+
+def _examination(output: Output, files: ReportFiles, metadata: RunMetadata) -> Examination:
+    return Examination(output.log, str(output.path), metadata, files, output.progress)
+
+
+def _no_grid(metadata: RunMetadata, what: str) -> dict[str, str]:
+    """The checks that are impossible without a rate."""
+    if metadata.rate is not None:
+        return {}
+    return dict.fromkeys(("grid", "index"), f"{what} no rate; {_NO_REPORT}")
 
 
 def _check_files(form: FileFormat, output: Output) -> Verdict:
     log = output.log
     reader = form.reader(log)
-    limits = dict(form.limits)
-    files = ReportFiles.read(log, output.files)
-    if not output.files.table.exists():
-        log.fail("table", TABLE, "the table of scans", "none")
+    files = _side_files(output)
     scans = form.files(log, output.path)
     if not scans:
         found = log.violations[0] if log.violations else "none"
@@ -97,12 +112,11 @@ def _check_files(form: FileFormat, output: Output) -> Verdict:
         ) from err
     metadata = files.metadata(log, own)
     reader.know(metadata)
-    if metadata.rate is None:
-        limits |= dict.fromkeys(("grid", "index"), f"rows have no rate; {_NO_REPORT}")
-    examination = Examination(log, str(output.path), metadata, files, output.progress)
+    examination = _examination(output, files, metadata)
     for scan in reader.scans(scans):
         examination.scan(scan)
     examination.finish(split=scans[0].sensor is not None)
+    limits = dict(form.limits) | _no_grid(metadata, "rows have")
     if reader.organized:
         limits |= npz.ORGANIZED_LIMITS
     return output.verdict(form.name, examination, limits, files)
@@ -110,31 +124,22 @@ def _check_files(form: FileFormat, output: Output) -> Verdict:
 
 def _check_rosbag2(output: Output) -> Verdict:
     from mlbatch.outputs.rosbag2 import open_bag
-    from mlbatch.verification.indexes import check_metadata
 
     paths, about = open_bag(output.log, output.path)
-
-    def check_yaml(topics: TopicChecks, files: Sequence[BagFile]) -> None:
-        check_metadata(output.log, about, files, topics.counts)
-
-    return _check_mcap(output, paths, "rosbag2", check_yaml)
+    return _check_mcap(output, paths, "rosbag2", about)
 
 
 def _check_mcap(
-    output: Output,
-    paths: Sequence[Path],
-    name: str,
-    check_yaml: Callable[[TopicChecks, Sequence[BagFile]], None] | None = None,
+    output: Output, paths: Sequence[Path], name: str, about: Yaml | None = None
 ) -> Verdict:
+    """about: metadata.yaml of a ROS 2 bag."""
     from mlbatch.outputs.mcap_file import McapFile
-    from mlbatch.verification.indexes import BagFile, McapIndexChecks
+    from mlbatch.verification.indexes import BagFile, McapIndexChecks, check_metadata
 
     log = output.log
-    grids = []
+    indexes = [McapIndexChecks(log, path.name) for path in paths]
     mcaps = []
-    indexes = []
-    for path in paths:
-        index = McapIndexChecks(log, path.name)
+    for path, index in zip(paths, indexes, strict=True):
         file = McapFile(log, path, path.name, index)
         grid = file.metadata.get("mlbatch.grid")
         if grid is None:
@@ -147,35 +152,26 @@ def _check_mcap(
                 f"{path}: expected a whole output, found one of the files of a bag; name its folder"
             )
         log.equal("metadata", f"{path.name} profile", "ros2", file.profile)
-        grids.append(grid)
         mcaps.append(file)
-        indexes.append(index)
-    where = paths[0].name
-    for path, grid in zip(paths[1:], grids[1:], strict=True):
-        log.equal("metadata", f"{path.name} mlbatch.grid", grids[0], grid)
-    if PIECES in grids[0] or len(paths) > 1:
-        files = ReportFiles.read(log, output.files)
-        if not output.files.table.exists():
-            log.fail("table", TABLE, "the table of scans", "none")
+    first, *others = (file.metadata["mlbatch.grid"] for file in mcaps)
+    for path, grid in zip(paths[1:], others, strict=True):
+        log.equal("metadata", f"{path.name} mlbatch.grid", first, grid)
+    if PIECES in first or others:
+        files = _side_files(output)
     else:
         attachment = mcaps[0].attachments.get(TABLE)
         report = mcaps[0].metadata.get("mlbatch.report")
         files = ReportFiles.inside(log, paths[0], report, attachment)
         files.check_copies(log, attachment, output.files)
-    metadata = files.metadata(log, metadata_of_grid(log, where, grids[0]))
-    examination = Examination(log, str(output.path), metadata, files, output.progress)
-    topics = TopicChecks(log, metadata, examination, files.report)
-    found = []
-    for path, file, index in zip(paths, mcaps, indexes, strict=True):
-        before = topics.counts.total()
-        topics.begin_file()
-        for message in file.messages():
-            topics.check(message)
-        found.append(BagFile(path.name, topics.counts.total() - before, index.span_ns))
-    topics.finish(where if len(paths) == 1 else output.path.name)
-    if check_yaml is not None:
-        check_yaml(topics, found)
-    return output.verdict(_format(name, topics), examination, _limits(topics), files)
+    metadata = files.metadata(log, metadata_of_grid(log, paths[0].name, first))
+    topics = TopicChecks(log, metadata, _examination(output, files, metadata), files.report)
+    counts = topics.check_files(mcaps, output.path.name if others else paths[0].name)
+    if about is not None:
+        spans = (index.span_ns for index in indexes)
+        names = (path.name for path in paths)
+        found = list(map(BagFile, names, counts, spans))
+        check_metadata(log, about, found, topics.counts)
+    return output.verdict(_format(name, topics), topics.examination, _limits(topics), files)
 
 
 def _check_bag(output: Output) -> Verdict:
@@ -185,18 +181,12 @@ def _check_bag(output: Output) -> Verdict:
     path = output.path
     files = ReportFiles.read(log, output.files)
     metadata = files.metadata(log, RunMetadata())
-    examination = Examination(log, str(path), metadata, files, output.progress)
-    topics = TopicChecks(log, metadata, examination, files.report)
-    topics.begin_file()
-    for message in BagFile(log, path, path.name).messages():
-        topics.check(message)
-    topics.finish(path.name)
-    limits = _limits(topics) | LIMITS
-    if metadata.rate is None:
-        limits |= dict.fromkeys(("grid", "index"), f"a bag has no rate; {_NO_REPORT}")
+    topics = TopicChecks(log, metadata, _examination(output, files, metadata), files.report)
+    topics.check_files([BagFile(log, path, path.name)], path.name)
+    limits = _limits(topics) | LIMITS | _no_grid(metadata, "a bag has")
     if files.table is None:
         limits |= dict.fromkeys(("columns", "table"), f"no {TABLE} next to the output")
-    return output.verdict(_format("rosbag1", topics), examination, limits, files)
+    return output.verdict(_format("rosbag1", topics), topics.examination, limits, files)
 
 
 def _format(name: str, topics: TopicChecks) -> str:

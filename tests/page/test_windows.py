@@ -91,10 +91,10 @@ def test_long_runs_are_summarised_by_their_worst_windows() -> None:
     found = windows(columns, [[512 - count for count in own] for own in columns])
     summary = summarise(found)
     assert summary.group == 2
-    assert len(summary.step) == rows // 2
+    assert len(summary.count) == rows // 2
     # Of windows 1000 and 1001.
-    np.testing.assert_array_equal(summary.fill[500], [1.0, 0.25])
-    np.testing.assert_array_equal(summary.columns[500], [1024, 640])
+    np.testing.assert_array_equal(summary.values["fill"][500], [1.0, 0.25])
+    np.testing.assert_array_equal(summary.values["columns"][500], [1024, 640])
     assert summary.incomplete.sum() == 0
     assert summary.count.sum() == rows
 
