@@ -19,7 +19,7 @@ from mlbatch.outputs.cloud_messages import CLOUD, read_cloud, stored_scan
 from mlbatch.outputs.containers import MessagePlace
 from mlbatch.outputs.damage import CheckLog, DamageError
 from mlbatch.outputs.encoding import MessageCursor
-from mlbatch.outputs.folders import ScanFile, scan_files
+from mlbatch.outputs.folders import ScanFile
 from mlbatch.outputs.kinds import FileFormat, format_of, kind_of
 from mlbatch.outputs.metadata import RunMetadata, metadata_of_grid
 from mlbatch.outputs.run_files import PIECES, RunFiles, inner_texts
@@ -83,7 +83,7 @@ def open_scans(path: Path, report: Path | None = None) -> IndexedScans:
     kind = kind_of(path)
     log = CheckLog()
     if kind.form is not None:
-        return _IndexedFiles(path, kind.form, scan_files(log, path, kind.form.suffix), log, report)
+        return _IndexedFiles(path, kind.form, kind.form.files(log, path), log, report)
     if kind.name:
         return _IndexedMessages(path, kind.name, log, report)
     found = "one file of a folder" if format_of([path]) is not None else kind.found
@@ -102,7 +102,7 @@ def _file_of_folder(path: Path) -> IndexedScans | None:
     # The files of a sensor are in a folder of their own.
     if not RunFiles.of(folder).report.exists() and RunFiles.of(folder.parent).report.exists():
         folder = folder.parent
-    files = [one for one in scan_files(CheckLog(), folder, form.suffix) if one.path == path]
+    files = [one for one in form.files(CheckLog(), folder) if one.path == path]
     return _IndexedFiles(folder, form, files, CheckLog(), None) if files else None
 
 

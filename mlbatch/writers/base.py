@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from fractions import Fraction
-from typing import TYPE_CHECKING, NamedTuple, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, NamedTuple, Protocol, TypeVar, runtime_checkable
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
@@ -11,6 +11,7 @@ if TYPE_CHECKING:
 
     from mlbatch.types import ImuSamples, Message, RunInfo, Scan, Summary
 
+Value = TypeVar("Value")
 DEFAULT_POINT_LAYOUT = "standard"
 NO_COMPRESSION = "none"
 # Number of checksums of scans: sums of CRC-32 are modulo this.
@@ -29,6 +30,11 @@ class WriterOptions(NamedTuple):
     max_bag_s: float = 0.0  # recorded time in a file of a ROS 2 bag, s; 0: all in one file
     files: FileSet | None = None  # the files that this run is to make; None: all
     only: Path | None = None  # the file that the only scan of a folder becomes; None: any number
+
+
+def fixed(value: Value) -> Callable[[WriterOptions], Value]:
+    """Return `extras` or `record_layout` of a format in which no option changes it."""
+    return lambda options: value
 
 
 class FileSet(Protocol):

@@ -19,7 +19,7 @@ from mlbatch.clocks.timescale import GPS_EPOCH_S, TAI, TAI_GPS_S, UTC, gps_utc_s
 from mlbatch.errors import ExportError, UsageError, install_extra
 from mlbatch.types import RecordLayout, RecordPiece, RunInfo
 from mlbatch.units import NS_PER_S
-from mlbatch.writers.base import ScanWriter, WriterOptions
+from mlbatch.writers.base import ScanWriter, WriterOptions, fixed
 from mlbatch.writers.point_layouts import ScanRecords, record_bytes
 from mlbatch.writers.scan_comments import scan_comments
 from mlbatch.writers.scan_folder import FolderWriter, check_dense
@@ -79,14 +79,9 @@ _PLAIN = RecordLayout(41, (RecordPiece("las", 0, 0, 41),), epoch_s=gps_shift_s)
 RECORD = RecordLayout(43, (RecordPiece("las", 0, 0, 43),), _PLAIN, gps_shift_s)
 
 
-def extras(options: WriterOptions) -> frozenset[str]:
-    """Return what extra bytes store."""
-    return frozenset({"reflectivity"})
-
-
-def record_layout(options: WriterOptions) -> RecordLayout | None:
-    """Return the records of all points."""
-    return RECORD
+# Reflectivities are extra bytes.
+extras = fixed(frozenset({"reflectivity"}))
+record_layout = fixed(RECORD)
 
 
 def open_folder(name: str, target: Path, info: RunInfo, options: WriterOptions) -> ScanWriter:

@@ -104,7 +104,7 @@ NewWire: TypeAlias = Callable[[], Wire]
 OpenFile: TypeAlias = Callable[[Path], MessageFile]
 
 
-def extras_of(options: WriterOptions, *encodings: str) -> frozenset[str]:
+def extras_of(encodings: tuple[str, ...], options: WriterOptions) -> frozenset[str]:
     """Return the inputs of the point layout, IMU samples, and messages in `encodings`."""
     layout = CLOUD_LAYOUTS.get(options.point_layout)
     return frozenset({IMU, *encodings}) | (frozenset() if layout is None else layout.extras)

@@ -78,12 +78,6 @@ def test_records_of_every_layout(layout: str) -> None:
     assert [records[axis].tolist() for axis in "xyz"] == [[1.0], [2.0], [3.0]]
 
 
-def test_records_of_the_standard_layout() -> None:
-    records = Scan.copied(point_scan()).points()
-    names = ("intensity", "time", "ring", "return_type", "lidar_id")
-    assert [records[name].item() for name in names] == [7.0, 0.0625, 258, 2, 1]
-
-
 def test_records_of_an_organized_scan_have_its_shape() -> None:
     scan = Scan.copied(organized_scan())
     records = scan.points()

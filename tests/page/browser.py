@@ -91,12 +91,10 @@ class Browser:
             **{"width": width, "height": 900, "deviceScaleFactor": 1, "mobile": False},
         )
         self.call("Page.navigate", url=page if isinstance(page, str) else page.resolve().as_uri())
-        until = time.monotonic() + _LONGEST_S
-        while not self.run(
-            "document.readyState === 'complete' && 'drawn' in document.documentElement.dataset"
-        ):
-            assert time.monotonic() < until, self.errors
-            time.sleep(0.05)
+        self.wait(
+            "document.readyState === 'complete' && 'drawn' in document.documentElement.dataset",
+            True,
+        )
         # Widths settle.
         time.sleep(0.2)
         self.run("0")
@@ -117,13 +115,30 @@ class Browser:
 
     def hover(self, selector: str, across: float, down: float) -> None:
         """Point at a place of an element, in shares of its size."""
-        box = self.run(
-            f"(() => {{ const b = document.querySelector({json.dumps(selector)})"
-            ".getBoundingClientRect(); return [b.left, b.top, b.width, b.height]; })()"
-        )
+        box = self._box(selector)
         x, y = box[0] + across * box[2], box[1] + down * box[3]
         self.call("Input.dispatchMouseEvent", type="mouseMoved", x=x, y=y)
         time.sleep(0.2)
+
+    def wait(self, script: str, value: object = None) -> None:
+        """Wait until an expression has a value; None: any."""
+        until = time.monotonic() + _LONGEST_S
+        while True:
+            found = self.run(script)
+            if found == value if value is not None else found is not None:
+                break
+            assert time.monotonic() < until, (found, self.errors)
+            time.sleep(0.02)
+        time.sleep(0.1)
+
+    def _box(self, selector: str) -> list[float]:
+        """Left, top, width and height of an element, which is scrolled into view."""
+        found: list[float] = self.run(
+            f"(() => {{ const e = document.querySelector({json.dumps(selector)});"
+            "e.scrollIntoView({block: 'center', behavior: 'instant'});"
+            "const b = e.getBoundingClientRect(); return [b.left, b.top, b.width, b.height]; })()"
+        )
+        return found
 
     def run(self, script: str) -> Any:
         """The value of an expression."""
@@ -131,18 +146,15 @@ class Browser:
         assert "exceptionDetails" not in found, found
         return found["result"].get("value")
 
-    def screenshot(self, path: Path) -> None:
-        """The whole page as PNG."""
+    def screenshot(self) -> tuple[int, int]:
+        """Width and height of a picture of the whole page."""
         found = self.call("Page.captureScreenshot", captureBeyondViewport=True)
-        path.write_bytes(base64.b64decode(found["data"]))
+        size = base64.b64decode(found["data"])[16:24]
+        return int.from_bytes(size[:4], "big"), int.from_bytes(size[4:], "big")
 
     def drag(self, selector: str, start: float, end: float) -> None:
         """Drag the mouse over an element, between two shares of its width."""
-        box = self.run(
-            f"(() => {{ const e = document.querySelector({json.dumps(selector)});"
-            "e.scrollIntoView({block: 'center', behavior: 'instant'});"
-            "const b = e.getBoundingClientRect(); return [b.left, b.top, b.width, b.height]; })()"
-        )
+        box = self._box(selector)
         y = box[1] + box[3] / 2
         places = [box[0] + share * box[2] for share in (start, (start + end) / 2, end)]
         for kind, x in zip(("mousePressed", "mouseMoved", "mouseReleased"), places, strict=True):

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Iterator
 from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
@@ -19,8 +18,7 @@ from mlbatch.page.comparison import binned, comparison_page, nice_step
 from mlbatch.page.instant import InstantSet, SharedInstant, Spot
 from mlbatch.page.points import CloudPoints
 from mlbatch.page.policies import PolicyFigures, offset_m
-from tests.page.browser import CHROMIUM, NO_CHROMIUM, Browser, browser
-from tests.page.test_view import wait_for
+from tests.page.browser import CHROMIUM, NO_CHROMIUM, Browser
 
 HOSTILE = "<script>alert(1)</script>&'\""
 
@@ -206,12 +204,6 @@ def test_medians_are_by_nearest_rank() -> None:
     assert PolicyFigures.median(np.zeros(0)) == 0.0
 
 
-@pytest.fixture(scope="module")
-def tab(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
-    with browser(tmp_path_factory.mktemp("profile")) as found:
-        yield found
-
-
 @pytest.mark.skipif(CHROMIUM is None, reason=NO_CHROMIUM)
 def test_both_clouds_are_shown_from_one_place(tab: Browser, tmp_path: Path) -> None:
     path = tmp_path / "page.html"
@@ -219,21 +211,21 @@ def test_both_clouds_are_shown_from_one_place(tab: Browser, tmp_path: Path) -> N
     tab.open(path)
     image = "document.querySelector('#stage canvas').toDataURL()"
     shown = "document.documentElement.dataset.shown"
-    wait_for(tab, shown, "0")
+    tab.wait(shown, "0")
     assert "age 150 to 0 ms" in tab.run("document.getElementById('legend').textContent")
     tab.run("document.getElementById('cloud').focus()")
     tab.press(" ")
-    wait_for(tab, shown, "1")
+    tab.wait(shown, "1")
     windows = tab.run(image)
     tab.run("document.getElementById('play').click()")
-    wait_for(tab, shown, "0")
+    tab.wait(shown, "0")
     fused = tab.run(image)
     # Of another colour, since older.
     assert windows != fused
     tab.press("f")
-    wait_for(tab, f"{image} === {json.dumps(fused)}", False)
+    tab.wait(f"{image} === {json.dumps(fused)}", False)
     tab.press("p")
-    wait_for(tab, f"{image} === {json.dumps(fused)}", True)
+    tab.wait(f"{image} === {json.dumps(fused)}", True)
     assert tab.errors == []
 
 

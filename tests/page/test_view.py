@@ -12,7 +12,6 @@ import socket
 import subprocess
 import sys
 import threading
-import time
 import urllib.request
 from collections.abc import Iterator
 from dataclasses import replace
@@ -29,7 +28,7 @@ from mlbatch.page.view_scans import MOST_KEPT, ViewScans
 from mlbatch.page.view_server import LOOPBACK, ViewServer
 from tests.builders.sessions import FIXTURE
 from tests.contract.tree import run_mlbatch
-from tests.page.browser import CHROMIUM, NO_CHROMIUM, Browser, browser
+from tests.page.browser import CHROMIUM, NO_CHROMIUM, Browser
 from tests.page.test_page import points_of
 
 CAPTURE = FIXTURE / "two_lidars.pcap"
@@ -39,9 +38,7 @@ SCANS = 7
 OUTPUTS = {
     "mcap": ("s.mcap", ()),
     "organized": ("s.mcap", ("--layout", "organized")),
-    "npz": ("s", ()),
     "split": ("s", ("--split",)),
-    "bag": ("s.bag", ()),
     "kitti": ("s", ("-f", "kitti")),
 }
 
@@ -98,14 +95,6 @@ def some_scans(count: int, error: Exception | None = None) -> Iterator[mlbatch.S
         )
     if error is not None:
         raise error
-
-
-def wait_for(tab: Browser, script: str, value: object) -> None:
-    """Wait until an expression has a value."""
-    until = time.monotonic() + 120
-    while (found := tab.run(script)) != value:
-        assert time.monotonic() < until, (found, tab.errors)
-        time.sleep(0.02)
 
 
 def convert(folder: Path, output: str, *options: str) -> Path:
@@ -305,7 +294,7 @@ def test_mistakes(words: str, code: int, expected: str, tmp_path: Path) -> None:
 
 
 @pytest.mark.skipif(CHROMIUM is None, reason=NO_CHROMIUM)
-def test_in_a_browser(tmp_path: Path) -> None:
+def test_in_a_browser(tab: Browser) -> None:
     shown = "document.documentElement.dataset.shown"
     click = "document.getElementById('play').click()"
     why = "document.getElementById('cloudwhy').textContent"
@@ -313,34 +302,33 @@ def test_in_a_browser(tmp_path: Path) -> None:
         "(() => {{ const s = document.getElementById('scan'); s.value = {0}; "
         "s.dispatchEvent(new Event('input')); return s.value; }})()"
     )
-    with browser(tmp_path / "profile") as tab:
-        begin = lambda: mlbatch.scans(CAPTURE, rig=RIG)  # noqa: E731
-        with served(ViewScans(begin, pytest.fail), expected=20) as server:
-            tab.open(server.url)
-            wait_for(tab, shown, "0")
-            # Scans that are not loaded; those that do not exist are the last.
-            for number, last in (("4", "4"), ("15", "6"), ("0", "0")):
-                assert tab.run(slide.format(number)) == number
-                wait_for(tab, shown, last)
-            assert tab.run("document.getElementById('scan').max") == "6"
-            tab.run(click)
-            # All scans, and the first again.
-            for number in ("3", "6", "0"):
-                wait_for(tab, f"{shown} === '{number}'", True)
-            tab.run(click)
-            # That of the tests.
-            assert "no WebGL with a graphics processor" in tab.run(why)
-            assert {url.removeprefix(server.url).split("/")[0] for url in tab.requests} == {
-                "",
-                "scans",
-            }
-            assert tab.errors == []
-        error = RecordingError("drive.pcap: damaged")
-        with served(ViewScans(lambda: some_scans(3, error), lambda text: None)) as server:
-            tab.open(server.url)
-            wait_for(tab, shown, "0")
-            tab.run(click)
-            wait_for(tab, why, "After 3 scans: drive.pcap: damaged")
-            assert tab.run(shown) == "2"
-            assert tab.run("document.getElementById('play').textContent") == "Play"
-            assert tab.errors == []
+    begin = lambda: mlbatch.scans(CAPTURE, rig=RIG)  # noqa: E731
+    with served(ViewScans(begin, pytest.fail), expected=20) as server:
+        tab.open(server.url)
+        tab.wait(shown, "0")
+        # Scans that are not loaded; those that do not exist are the last.
+        for number, last in (("4", "4"), ("15", "6"), ("0", "0")):
+            assert tab.run(slide.format(number)) == number
+            tab.wait(shown, last)
+        assert tab.run("document.getElementById('scan').max") == "6"
+        tab.run(click)
+        # All scans, and the first again.
+        for number in ("3", "6", "0"):
+            tab.wait(f"{shown} === '{number}'", True)
+        tab.run(click)
+        # That of the tests.
+        assert "no WebGL with a graphics processor" in tab.run(why)
+        assert {url.removeprefix(server.url).split("/")[0] for url in tab.requests} == {
+            "",
+            "scans",
+        }
+        assert tab.errors == []
+    error = RecordingError("drive.pcap: damaged")
+    with served(ViewScans(lambda: some_scans(3, error), lambda text: None)) as server:
+        tab.open(server.url)
+        tab.wait(shown, "0")
+        tab.run(click)
+        tab.wait(why, "After 3 scans: drive.pcap: damaged")
+        assert tab.run(shown) == "2"
+        assert tab.run("document.getElementById('play').textContent") == "Play"
+        assert tab.errors == []

@@ -192,21 +192,6 @@ def test_sensors_of_one_window_share_a_row() -> None:
     assert table.statistics(0).written == 1
 
 
-def test_a_row_of_several_sensors_is_counted_before_it_is_complete() -> None:
-    left = replace(dense_scan(points=2, columns=4), columns_per_sensor=(4, 0))
-    right = replace(dense_scan(points=3, columns=4), columns_per_sensor=(0, 4))
-    table = ScanTable(run_info())
-    assert table.rows == 0
-    table.add(left)
-    # As a progress bar does, in another thread.
-    assert table.rows == 1
-    table.add(right)
-    assert table.rows == 1
-    _, row = csv.reader(io.StringIO(table.text()))
-    assert row[6:10] == ["5", "8", "4", "4"]
-    assert (table.rows, table.statistics(0).points) == (1, 5)
-
-
 @pytest.mark.parametrize("scans", [1, 63, 64, 65, 128, 129, 1000])
 def test_tables_have_a_row_for_every_window(scans: int) -> None:
     table = ScanTable(run_info())

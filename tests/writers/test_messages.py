@@ -186,15 +186,6 @@ def test_organized_clouds(name: str, tmp_path: Path) -> None:
 
 
 @each_container
-def test_split_gives_a_topic_a_sensor(name: str, tmp_path: Path) -> None:
-    scans = [dense_scan(0), dense_scan(0)]
-    path = written(name, tmp_path / OUTPUTS[name], scans, split=True)
-    topics = {message.topic for message in read_back(path)}
-    assert {"/left/points", "/right/points"} < topics
-    assert "/points" not in topics
-
-
-@each_container
 def test_a_run_without_scans(name: str, tmp_path: Path) -> None:
     writer = open_writer(name, tmp_path / OUTPUTS[name], run_info(), WriterOptions())
     writer.write_imu(imu_samples(count=0))

@@ -40,13 +40,11 @@ def packed(scan: Scan, name: str) -> Records:
 @pytest.mark.parametrize(
     ("name", "form", "values"),
     [
-        ("standard", "<fffffHBB", (1, 2, 3, 7, 0.0625, 258, 2, 1)),
         ("velodyne", "<ffffHf", (1, 2, 3, 7, 258, 0.0625)),
         ("ouster", "<fff4xfIHHH2xI12x", (1, 2, 3, 7, 62_500_000, 300, 258, 0, 1500)),
         ("hesai", "<ffffHd", (1, 2, 3, 7, 258, 1_700_000_000.1625)),
         ("kiss-icp", "<ffff", (1, 2, 3, 0.0625)),
         ("minimal", "<fff", (1, 2, 3)),
-        ("ply", "<ffffdiBB", (1, 2, 3, 7, 0.0625, 258, 2, 1)),
     ],
 )
 def test_presets_by_hand(name: str, form: str, values: tuple[float, ...]) -> None:

@@ -27,23 +27,6 @@ def test_names(index: int, slice_: int, slices: int, name: str) -> None:
     assert scan_name(index, slice_, slices) == name
 
 
-def test_split_gives_a_folder_a_sensor(tmp_path: Path) -> None:
-    writer = open_writer("npz", tmp_path / "out", run_info(), WriterOptions(split=True))
-    for sensor in range(2):
-        run_job(writer.write(dense_scan(seed=sensor), sensor))
-    run_job(writer.flush())
-    writer.finish(SUMMARY)
-    found = sorted(str(path.relative_to(tmp_path)) for path in tmp_path.rglob("*.npz"))
-    assert found == ["out/left/000000.npz", "out/right/000000.npz"]
-
-
-def test_an_abandoned_output_stays_partial(tmp_path: Path) -> None:
-    writer = open_writer("npz", tmp_path / "out", run_info(), WriterOptions())
-    run_job(writer.write(dense_scan()))
-    writer.abandon()
-    assert [path.name for path in tmp_path.iterdir()] == ["out.partial"]
-
-
 def test_files_of_other_runs_are_left_to_them(tmp_path: Path) -> None:
     """A skipped scan has no file, but is in lists of all; others are noted once they are whole."""
     noted = Noted()

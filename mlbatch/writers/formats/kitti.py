@@ -9,8 +9,8 @@ from __future__ import annotations
 from functools import partial
 from pathlib import Path
 
-from mlbatch.types import RecordLayout, RunInfo
-from mlbatch.writers.base import ScanWriter, WriterOptions
+from mlbatch.types import RunInfo
+from mlbatch.writers.base import ScanWriter, WriterOptions, fixed
 from mlbatch.writers.point_layouts import ROWS_KITTI
 from mlbatch.writers.scan_comments import RecordEncoder
 from mlbatch.writers.scan_folder import TIMES_TXT, FolderWriter, check_dense, times_text
@@ -19,16 +19,8 @@ FORMAT = "kitti"
 SUFFIX: str | None = None
 COMPRESSES = False
 FILE_SUFFIXES = ("bin",)
-
-
-def extras(options: WriterOptions) -> frozenset[str]:
-    """Return nothing: the columns are fixed."""
-    return frozenset()
-
-
-def record_layout(options: WriterOptions) -> RecordLayout | None:
-    """Return the rows."""
-    return ROWS_KITTI.record
+extras = fixed(frozenset[str]())
+record_layout = fixed(ROWS_KITTI.record)
 
 
 def open_writer(target: Path, info: RunInfo, options: WriterOptions) -> ScanWriter:

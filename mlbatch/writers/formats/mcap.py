@@ -5,26 +5,19 @@ Recorded messages are forwarded unchanged, also those of ROS 1: MCAP can contain
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 
 from mlbatch.ros.encoding import Cdr
-from mlbatch.types import RecordLayout, RunInfo
+from mlbatch.types import RunInfo
 from mlbatch.writers.base import ScanWriter, WriterOptions
 from mlbatch.writers.message_writer import MessageFile, MessageWriter, extras_of, record_of
 
 FORMAT = "mcap"
 SUFFIX: str | None = ".mcap"
 COMPRESSES = True
-
-
-def extras(options: WriterOptions) -> frozenset[str]:
-    """Return the inputs of the point layout, IMU samples and messages."""
-    return extras_of(options, "cdr", "ros1")
-
-
-def record_layout(options: WriterOptions) -> RecordLayout | None:
-    """Return the records of the point layout."""
-    return record_of(options)
+extras = partial(extras_of, ("cdr", "ros1"))
+record_layout = record_of
 
 
 def open_writer(target: Path, info: RunInfo, options: WriterOptions) -> ScanWriter:

@@ -5,18 +5,14 @@ from __future__ import annotations
 from pathlib import Path
 
 from mlbatch.types import EXTRAS, RunInfo
-from mlbatch.writers.base import ScanWriter, WriterOptions
+from mlbatch.writers.base import ScanWriter, WriterOptions, fixed
 from mlbatch.writers.npz_encoder import NpzEncoder
 from mlbatch.writers.scan_folder import FolderWriter
 
 FORMAT = "npz"
 SUFFIX: str | None = None
 COMPRESSES = False
-
-
-def extras(options: WriterOptions) -> frozenset[str]:
-    """Return all: an npz contains everything that was decoded."""
-    return EXTRAS
+extras = fixed(EXTRAS)
 
 
 def open_writer(target: Path, info: RunInfo, options: WriterOptions) -> ScanWriter:

@@ -12,7 +12,7 @@ from functools import partial
 from pathlib import Path
 
 from mlbatch.types import RunInfo
-from mlbatch.writers.base import ScanWriter, WriterOptions
+from mlbatch.writers.base import ScanWriter, WriterOptions, fixed
 from mlbatch.writers.point_layouts import ROWS_NUSCENES, ROWS_TIME
 from mlbatch.writers.scan_comments import RecordEncoder
 from mlbatch.writers.scan_folder import TIMES_TXT, FolderWriter, check_dense, times_text
@@ -21,11 +21,7 @@ FORMAT = "nuscenes"
 SUFFIX: str | None = None
 COMPRESSES = False
 FILE_SUFFIXES = ("pcd.bin", "time.bin")
-
-
-def extras(options: WriterOptions) -> frozenset[str]:
-    """Return nothing: the columns are fixed."""
-    return frozenset()
+extras = fixed(frozenset[str]())
 
 
 def open_writer(target: Path, info: RunInfo, options: WriterOptions) -> ScanWriter:

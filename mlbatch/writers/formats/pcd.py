@@ -9,8 +9,8 @@ from __future__ import annotations
 from functools import partial
 from pathlib import Path
 
-from mlbatch.types import RecordLayout, RunInfo
-from mlbatch.writers.base import DEFAULT_POINT_LAYOUT, ScanWriter, WriterOptions
+from mlbatch.types import RunInfo
+from mlbatch.writers.base import DEFAULT_POINT_LAYOUT, ScanWriter, WriterOptions, fixed
 from mlbatch.writers.point_layouts import CLOUD_LAYOUTS
 from mlbatch.writers.scan_comments import RecordEncoder
 from mlbatch.writers.scan_folder import FolderWriter
@@ -21,16 +21,8 @@ COMPRESSES = False
 
 # Its fields follow each other without gaps, as PCD requires.
 _LAYOUT = CLOUD_LAYOUTS[DEFAULT_POINT_LAYOUT]
-
-
-def extras(options: WriterOptions) -> frozenset[str]:
-    """Return nothing: the fields are fixed."""
-    return _LAYOUT.extras
-
-
-def record_layout(options: WriterOptions) -> RecordLayout | None:
-    """Return the records of all points."""
-    return _LAYOUT.record
+extras = fixed(_LAYOUT.extras)
+record_layout = fixed(_LAYOUT.record)
 
 
 def open_writer(target: Path, info: RunInfo, options: WriterOptions) -> ScanWriter:

@@ -9,7 +9,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from mlbatch.types import RecordLayout, RunInfo
-from mlbatch.writers.base import ScanWriter, WriterOptions
+from mlbatch.writers.base import ScanWriter, WriterOptions, fixed
 from mlbatch.writers.point_layouts import PLY_LAYOUTS
 from mlbatch.writers.scan_comments import RecordEncoder
 from mlbatch.writers.scan_folder import FolderWriter, check_dense
@@ -17,11 +17,7 @@ from mlbatch.writers.scan_folder import FolderWriter, check_dense
 FORMAT = "ply"
 SUFFIX: str | None = None
 COMPRESSES = False
-
-
-def extras(options: WriterOptions) -> frozenset[str]:
-    """Return nothing: the properties are fixed."""
-    return frozenset()
+extras = fixed(frozenset[str]())
 
 
 def record_layout(options: WriterOptions) -> RecordLayout | None:

@@ -5,12 +5,13 @@ There is one file, or with `--max-bag-duration` one for each so many windows (`b
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from mlbatch.errors import ExportError
 from mlbatch.ros.encoding import Cdr
-from mlbatch.types import RecordLayout, RunInfo, Topic
+from mlbatch.types import RunInfo, Topic
 from mlbatch.writers.bag_metadata import METADATA, file_of_container, metadata_text
 from mlbatch.writers.base import ScanWriter, WriterOptions
 from mlbatch.writers.message_writer import MessageFile, MessageWriter, extras_of, record_of
@@ -21,16 +22,8 @@ if TYPE_CHECKING:
 FORMAT = "rosbag2"
 SUFFIX: str | None = None
 COMPRESSES = True
-
-
-def extras(options: WriterOptions) -> frozenset[str]:
-    """Return the inputs of the point layout, IMU samples and messages."""
-    return extras_of(options, "cdr")
-
-
-def record_layout(options: WriterOptions) -> RecordLayout | None:
-    """Return the records of the point layout."""
-    return record_of(options)
+extras = partial(extras_of, ("cdr",))
+record_layout = record_of
 
 
 def open_writer(target: Path, info: RunInfo, options: WriterOptions) -> ScanWriter:

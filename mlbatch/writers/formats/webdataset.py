@@ -20,7 +20,7 @@ from isal.isal_zlib import crc32
 
 from mlbatch.types import EXTRAS, RunInfo, Scan, Summary
 from mlbatch.writers.atomic import export_errors
-from mlbatch.writers.base import CHECKSUMS, ScanJob, ScanWriter, WriterOptions
+from mlbatch.writers.base import CHECKSUMS, ScanJob, ScanWriter, WriterOptions, fixed
 from mlbatch.writers.npz_encoder import NpzEncoder
 from mlbatch.writers.output_file import Bytes, OutputFile, take_scratch
 from mlbatch.writers.scan_folder import FolderWriter, name_of_windows, scan_name
@@ -30,11 +30,7 @@ SUFFIX: str | None = None
 COMPRESSES = False
 FILE_SUFFIXES = ("tar",)
 WINDOWS_PER_FILE = 500
-
-
-def extras(options: WriterOptions) -> frozenset[str]:
-    """Return all: an npz contains everything that was decoded."""
-    return EXTRAS
+extras = fixed(EXTRAS)
 
 
 def open_writer(target: Path, info: RunInfo, options: WriterOptions) -> ScanWriter:
