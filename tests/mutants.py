@@ -153,7 +153,13 @@ class Tests:
             return "gone"
         at = min(starts, key=lambda start: abs(start + 1 - mutant.line))
         executed = self.data.contexts_by_lineno(str(path))
-        contexts = {one for n in range(at, at + len(before)) for one in executed.get(n + 1, [])}
+        # Coverage notes the first line of a statement.
+        around = [
+            range(node.lineno, (node.end_lineno or node.lineno) + 1)
+            for node in ast.walk(ast.parse(text))
+            if isinstance(node, ast.stmt) and node.lineno <= at + 1 <= (node.end_lineno or 0)
+        ]
+        contexts = {one for n in min(around, key=len) for one in executed.get(n, [])}
         if not contexts:
             return "not run"
         # Lines of a module's body run before any test.
