@@ -24,9 +24,9 @@ if TYPE_CHECKING:
     from mlbatch.poses.check import PoseComparison
     from mlbatch.poses.solve import Cloud
 
-# Of a lidar in a window, until surfaces match and then; of more, every second column is read, or
-# every third.
-_SLOTS, _MORE_SLOTS = 1 << 13, 1 << 15
+# Of a lidar in a window of the first place, and of others: if all is clear, and if more points pay.
+# Of more, every second column is read, or every third.
+_FIRST_SLOTS, _FEW_SLOTS, _MANY_SLOTS = 1 << 14, 1 << 13, 1 << 15
 # Points (n, 3) of a lidar in a window or slice, and their stamps (n,).
 _Points: TypeAlias = tuple[F64Array, I64Array]
 # Nearer points are of the machine, farther ones too sparse to show surfaces.
@@ -89,8 +89,9 @@ class PoseCheck:
 
     def _points(self, window: Window, lidar: int) -> _Points:
         """Points of a lidar in columns at equal steps."""
-        needs_more = self._comparison is not None and self._comparison.needs_more
-        most = _MORE_SLOTS if needs_more else _SLOTS
+        most = _FIRST_SLOTS
+        if self._comparison is not None and self._comparison.places:
+            most = _MANY_SLOTS if self._comparison.needs_more else _FEW_SLOTS
         rows = np.flatnonzero(window.columns.sensor == lidar)
         step = max(1, round(len(rows) * self._slots[lidar] * self._slices / most))
         scan = self._decode(window.columns.take(rows[::step]), window.start_ns, window.end_ns)
