@@ -126,6 +126,8 @@ def test_columns_have_the_stamp_of_their_points() -> None:
     assert lidar.channel.tolist() == [0, 1]
     assert not lidar.sends_twice
     assert not lidar.has_reflectivity
+    # A cloud does not say how many columns were measured in a second.
+    assert lidar.columns_per_s == 0
 
 
 def test_packets_of_another_layout_are_faults() -> None:
