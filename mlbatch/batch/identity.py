@@ -41,7 +41,9 @@ def session_key(session: Session, cwd: Path) -> Key:
         "mlbatch": mlbatch.__version__,
         "numpy": np.__version__,
         "options": " ".join(session.key_words),
-        "recordings": "; ".join([*sizes, *_remote(list(filter(is_url, session.inputs)))]),
+        "recordings": "; ".join(
+            [*sizes, *_remote(list(filter(is_url, session.inputs)), session.local_rig)]
+        ),
         TIMES: "; ".join(str(one.st_mtime_ns) for _, one in stats),
         "rig": "" if session.rig is None else _rig(session.rig, rig),
         "calibrations": _calibrations(session),
@@ -82,13 +84,14 @@ def _local(session: Session) -> list[Path]:
     return [Path(one) for one in session.inputs if not is_url(one)]
 
 
-def _remote(urls: Sequence[str]) -> list[str]:
-    """Name, size and version of files in object storage, and of calibrations next to them."""
+def _remote(urls: Sequence[str], rig: Path | None = None) -> list[str]:
+    """Name, size and version of files in object storage, and of their calibrations."""
     if not urls:
         return []
-    from mlbatch.batch.remote import with_calibrations
+    from mlbatch.batch.remote import named_by_recipe, with_calibrations
 
-    return [f"{file.name} {file.size} {file.version}" for file in with_calibrations(urls)]
+    files = [*with_calibrations(urls), *named_by_recipe(urls, rig).values()]
+    return [f"{file.name} {file.size} {file.version}" for file in dict.fromkeys(files)]
 
 
 def _digest(file: Path) -> str:

@@ -26,11 +26,12 @@ from mlbatch.batch.session import (
 )
 from mlbatch.errors import RecordingError, UsageError
 from mlbatch.readers.datasets import BAG_METADATA
+from mlbatch.rig.recipes import rig_of
 from mlbatch.rig.yaml_tree import Node, read_yaml
 
 SCHEMA = "mlbatch.batch/1"
-_KEYS = ("schema", "rig", "rigs", "options", "limits", "known_bad", "sessions")
-_SESSION_KEYS = ("glob", "name", "inputs", "rig", "options", "limits")
+_KEYS = ("schema", "rig", "dataset", "rigs", "options", "limits", "known_bad", "sessions")
+_SESSION_KEYS = ("glob", "name", "inputs", "rig", "dataset", "options", "limits")
 _RULE_KEYS = ("sessions", "from", "until", "rig")
 _LIMIT_KEYS = ("time", "disk")
 _TEXT = re.compile(r"\S(.*\S)?")
@@ -261,21 +262,31 @@ def _of_manifest(path: Path, given: Common, say: Callable[[str], None]) -> Itera
     nodes = root["sessions"].elements("sessions")
     if not nodes:
         raise root["sessions"].error("a list of sessions", "an empty one", "add one")
+    of_manifest = _rig(root)
     rules = tuple(map(_rule, root["rigs"].elements("rules"))) if "rigs" in root else ()
     found: list[Session] = []
     for node in nodes:
         entries = node.fields(_SESSION_KEYS)
         own = _options(entries.get("options"))
         common = replace(given, options=_joined(of_all, own, mine))
-        rig = entries.get("rig", root.get("rig"))
+        rig = _rig(entries)
         if given.rig is None:
-            common = replace(common, rules=() if "rig" in entries else rules)
-        if given.rig is None and rig is not None:
-            common = replace(common, rig=_rig_path(rig), rig_place=rig.place)
+            common = replace(common, rules=rules if rig is None else ())
+            of_session, place = rig or of_manifest or (None, "")
+            common = replace(common, rig=of_session, rig_place=place)
         for limits in filter(None, (root.get("limits"), entries.get("limits"))):
             common = replace(common, limits=_limits(limits, common.limits, given.limits))
         found += _of_entry(node, entries, common, say)
     yield from _with_known_bad(found, root.get("known_bad"))
+
+
+def _rig(entries: Mapping[str, Node]) -> tuple[str, str] | None:
+    """The rig of all sessions or of one, and its place: by the key rig, or dataset."""
+    rig, dataset = entries.get("rig"), entries.get("dataset")
+    if dataset is not None:
+        given = None if rig is None else Path(_text(rig))
+        return str(rig_of(given, _text(dataset), dataset.place)), dataset.place
+    return None if rig is None else (_rig_path(rig), rig.place)
 
 
 def _rule(node: Node) -> RigRule:

@@ -173,6 +173,42 @@ def with_calibrations(urls: Sequence[str]) -> list[RemoteFile]:
     return list({one.url: one for one in (*files, *near)}.values())
 
 
+def named_by_recipe(urls: Sequence[str], rig: Path | None) -> dict[tuple[str, str], RemoteFile]:
+    """Files that a recipe names, by the folder of a recording and their path in a copy of it.
+
+    They are searched as for local recordings: in its folder, or up to two above. Raises
+    RecordingError where one lacks, or is not the only one.
+    """
+    from mlbatch.rig.recipes import LEVELS, named_files
+
+    found = {}
+    for node in [] if rig is None else named_files(rig):
+        for folder in dict.fromkeys(url.rpartition("/")[0] for url in urls):
+            # Not above the bucket.
+            ends = [folder, *(folder.rsplit("/", at)[0] for at in range(1, LEVELS))]
+            places = [end for end in ends if end.count("/") > 1]
+            matches = next(filter(None, (_named(place, node.text) for place in places)), [])
+            if len(matches) != 1:
+                shown = ", ".join(one.name for one in matches) or "none"
+                raise RecordingError(
+                    f"{folder}: expected one {node.text} in it or a folder above, which "
+                    f"{node.place} names, found {shown}; keep that of the recordings there"
+                )
+            parent = node.text.rpartition("/")[0]
+            found[folder, f"{parent}/{matches[0].name}".lstrip("/")] = matches[0]
+    return found
+
+
+def _named(folder: str, name: str) -> list[RemoteFile]:
+    """Files of a name, or a pattern, in a folder."""
+    if folder.partition("://")[0] in _WEB:
+        with contextlib.suppress(RecordingError):
+            return [head(f"{folder}/{name}")]
+        return []
+    parent, _, pattern = f"{folder}/{name}".rpartition("/")
+    return [one for one in inside(parent) if fnmatch.fnmatchcase(one.name, pattern)]
+
+
 def calibrations(url: str) -> list[RemoteFile]:
     """Files in the folder of a recording that may be calibrations, as `convert` looks for them."""
     from mlbatch.discovery.calibrations import CALIBRATION_SUFFIXES, MAX_CALIBRATION_FILE_BYTES
@@ -188,7 +224,14 @@ def calibrations(url: str) -> list[RemoteFile]:
 def inside(folder: str) -> list[RemoteFile]:
     """The files right in a folder."""
     folder = folder.rstrip("/")
-    return [one for one in listed(folder) if one.url.rpartition("/")[0] == folder]
+    if folder.partition("://")[0] in _WEB:
+        return []
+    place = _place(f"{folder}/")
+    import obstore
+
+    prefix = place.path.rstrip("/") or None
+    found = _repeated(folder, lambda: obstore.list_with_delimiter(place.store, prefix=prefix))
+    return sorted(_remote_file(place.root, meta) for meta in found["objects"])
 
 
 def matching(pattern: str) -> list[str]:
@@ -226,16 +269,22 @@ def default_cache() -> Path:
 
 
 @contextlib.contextmanager
-def fetched(urls: Sequence[str], cache: Path, user: object) -> Iterator[dict[str, str]]:
+def fetched(
+    urls: Sequence[str], cache: Path, user: object, rig: Path | None = None
+) -> Iterator[dict[str, str]]:
     """Paths of local copies of files, by URL; calibrations lie next to them. Removed at the end.
 
-    user: what the copies are for; only one process uses them at a time. Copies of an interrupted
-    run stay for the next one. Other versions of the files have another folder.
+    user: what the copies are for; only one process uses them at a time; rig: may be a recipe, whose
+    files are copied, too. Copies of an interrupted run stay for the next one. Other versions of the
+    files have another folder.
     """
     files = with_calibrations(urls)
-    folder = cache / "inputs" / digest_of(user, *files)
+    named = named_by_recipe(urls, rig)
+    folder = cache / "inputs" / digest_of(user, *files, *named.values())
     copies = {file.url: _copy_in(folder, file.url) for file in files}
-    needed = sum(file.size for file in files if not copies[file.url].exists())
+    targets = {path: file for file, path in zip(files, copies.values(), strict=True)}
+    targets |= {_copy_in(folder, f"{place}/") / name: one for (place, name), one in named.items()}
+    needed = sum(file.size for path, file in targets.items() if not path.exists())
     if needed:
         folder.mkdir(parents=True, exist_ok=True)
         free = shutil.disk_usage(folder).free
@@ -244,9 +293,9 @@ def fetched(urls: Sequence[str], cache: Path, user: object) -> Iterator[dict[str
                 f"{cache}: expected {needed} free bytes for {', '.join(urls)}, found {free}; give "
                 "another folder with --cache or $MLBATCH_CACHE"
             )
-    for file in files:
-        if not copies[file.url].exists():
-            download(file, copies[file.url])
+    for path, file in targets.items():
+        if not path.exists():
+            download(file, path)
     is_kept = False
     try:
         yield {url: str(copies[url]) for url in urls}

@@ -90,6 +90,11 @@ class Session:
         """Recordings and rig that are in a store."""
         return [text for text in (*self.inputs, self.rig or "") if is_url(text)]
 
+    @property
+    def local_rig(self) -> Path | None:
+        """The rig, unless it is in a store."""
+        return None if self.rig is None or is_url(self.rig) else Path(self.rig)
+
     def values(self, name: str, rig: Rig | None = None) -> tuple[str, ...]:
         """Values of an option of `convert`: as given, else from the rig."""
         kept = {one.name: one.values for one in rig.options} if rig is not None else {}

@@ -240,7 +240,7 @@ def _staged(task: Task) -> Iterator[Task]:
         return
     from mlbatch.batch.remote import fetched
 
-    with fetched(session.urls, task.cache, task.upload or task.folder) as copies:
+    with fetched(session.urls, task.cache, task.upload or task.folder, session.local_rig) as copies:
         inputs = tuple(copies.get(one, one) for one in session.inputs)
         rig = None if session.rig is None else copies.get(session.rig, session.rig)
         yield replace(task, session=replace(session, inputs=inputs, rig=rig))

@@ -17,6 +17,7 @@ from mlbatch.batch.session import is_url
 from mlbatch.cli import EXIT_LIMIT
 from mlbatch.cli.summary import say
 from mlbatch.errors import ExportError, RecordingError, UsageError
+from mlbatch.rig.recipes import rig_of
 
 _OUTPUT = ("-o", "--output")
 # Files that are written apart from the output.
@@ -40,7 +41,7 @@ def convert_remote(given: Sequence[str]) -> None:
     cache = remote.default_cache().absolute()
     inputs = [url for url in urls if url != target]
     folder = cache / "outputs" / remote.digest_of(target)
-    with interruptible(), remote.fetched(inputs, cache, outputs or words) as copies:
+    with interruptible(), remote.fetched(inputs, cache, outputs or words, _rig(words)) as copies:
         for url, path in copies.items():
             say(f"{url}: copied to {path} ({Path(path).stat().st_size} bytes)")
         if target:
@@ -57,6 +58,18 @@ def _split(word: str) -> Sequence[str]:
     """An option with `=` and a URL as two words."""
     name, _, value = word.partition("=")
     return (name, value) if name.startswith("--") and is_url(value) else (word,)
+
+
+def _rig(words: Sequence[str]) -> Path | None:
+    """The local rig, or the recipe of a dataset."""
+    for word, following in zip(words, [*words[1:], ""], strict=True):
+        name, is_joined, own = word.partition("=")
+        value = own if is_joined else following
+        if name == "--dataset":
+            return rig_of(None, value)
+        if name in ("--rig", "-r") and not is_url(value):
+            return Path(value)
+    return None
 
 
 def _check_new(target: str) -> None:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import difflib
 import re
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -26,7 +26,8 @@ UNKNOWN = "not verified"
 _TEXT = re.compile(r"\S(.*\S)?")
 _PAGE = re.compile(r"https?://\S+")
 # Folders, with those above a recording, in which a dataset may have its calibration.
-_LEVELS = 3
+LEVELS = 3
+_FILE_KEYS = ("file", "metadata")
 
 
 class Dataset(NamedTuple):
@@ -144,12 +145,30 @@ def with_files(root: Node, recordings: Sequence[Path]) -> Node:
     folders = [] if root.file.parent == FOLDER else [root.file.parent]
     for recording in recordings or (Path(),):
         folder = (recording if recording.is_dir() else recording.parent).absolute()
-        folders += [folder, *folder.parents[: _LEVELS - 1]]
+        folders += [folder, *folder.parents[: LEVELS - 1]]
     return _with_files(root, "", tuple(dict.fromkeys(folders)), dataset)
 
 
+def named_files(rig: Path) -> list[Node]:
+    """Files that a recipe names and that are not next to it; none of another rig."""
+    root = read_yaml(rig)
+    if DATASET not in root.entries:
+        return []
+    named = {node.text: node for node in _named(root, "")}
+    return [node for node in named.values() if next(rig.parent.glob(node.text), None) is None]
+
+
+def _named(node: Node, key: str) -> Iterator[Node]:
+    if key in _FILE_KEYS and node.kind == "scalar":
+        yield node
+    for name, one in node.entries.items():
+        yield from _named(one, name)
+    for one in node.items:
+        yield from _named(one, key)
+
+
 def _with_files(node: Node, key: str, folders: Sequence[Path], dataset: Dataset) -> Node:
-    if key in ("file", "metadata") and node.kind == "scalar":
+    if key in _FILE_KEYS and node.kind == "scalar":
         return node._replace(text=str(_found(node, folders, dataset)))
     entries = {name: _with_files(one, name, folders, dataset) for name, one in node.entries.items()}
     items = tuple(_with_files(one, key, folders, dataset) for one in node.items)

@@ -10,6 +10,7 @@ from mlbatch.batch.identity import session_key
 from mlbatch.batch.manifest import Common, chosen, parse_part, sessions_of
 from mlbatch.batch.session import OWN, Option, Session
 from mlbatch.errors import MlbatchError, RigError, UsageError
+from mlbatch.rig.recipes import FOLDER
 
 SENSOR = "sensors: [{name: a, stream: {port: 7502}}]\n"
 SWEEPS = "sensors: [{name: a, points: {glob: top/*.bin, dtype: {x: f4, y: f4, z: f4, t: u4}}}]\n"
@@ -157,6 +158,23 @@ def test_sessions_of_a_manifest(name: str, tmp_path: Path) -> None:
     assert {key: shown(one, tmp_path) for key, one in found.items()} == expected
 
 
+def test_a_dataset_is_a_rig_of_the_package(tmp_path: Path) -> None:
+    """Of all sessions, or of one; that of a session precedes a rig and the rules of all."""
+    touch(tmp_path, "a.yaml b.yaml")
+    sessions = "sessions: [{inputs: [a.bag]}, {inputs: [b.bag], %s}]\n"
+    texts = {
+        "dataset: mcd\n" + sessions % "rig: b.yaml": [FOLDER / "mcd.yaml", tmp_path / "b.yaml"],
+        "rigs: [{sessions: '*', rig: a.yaml}]\n" + sessions % "dataset: mcd": [
+            tmp_path / "a.yaml",
+            FOLDER / "mcd.yaml",
+        ],
+        "rig: a.yaml\n" + sessions % "dataset: mcd": [tmp_path / "a.yaml", FOLDER / "mcd.yaml"],
+    }
+    for text, rigs in texts.items():
+        assert [one.rig for one in read(tmp_path, text).values()] == list(map(str, rigs))
+        assert {one.rig for one in read(tmp_path, text, Common("r.yaml")).values()} == {"r.yaml"}
+
+
 def test_the_command_line_precedes_the_manifest(tmp_path: Path) -> None:
     given = Common("mine.yaml", (Option("--rate", ("5",)),))
     for session in read(tmp_path, LAYERS, given).values():
@@ -197,6 +215,12 @@ MISTAKES = {
     "unknown field": ('sessions: [{glob: "*.yaml", name: "{date}"}]\n', "{folder}"),
     "unknown field of a rig": (f'rig: "{{dir}}/r.yaml"\n{FOLDERS}', "found {dir}"),
     "no rig": ("sessions: [{name: b7, inputs: [a.pcap], rig: raw/rig.yaml}]\n", NO_RIG),
+    "rig and dataset": (f"rig: r.yaml\ndataset: mcd\n{ONE}", "a dataset or a rig, found both"),
+    "no dataset": (
+        "sessions: [{inputs: [a.pcap], dataset: mdc}]\n",
+        "sessions[0].dataset: expected the name of a dataset, found 'mdc'; the nearest are mcd",
+    ),
+    "a dataset that is refused": (f"dataset: lyft\n{ONE}", "its points have no time"),
     "slash in a name": ("sessions: [{name: a/b, inputs: [x]}]\n", "folder name"),
     "dots": ('sessions: [{name: "..", inputs: [x]}]\n', "folder name"),
     "the same name": ("sessions: [{inputs: [a/x.pcap]}, {inputs: [b/X.pcap]}]\n", "different"),

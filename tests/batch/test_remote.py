@@ -8,12 +8,17 @@ import shutil
 from collections.abc import Iterator
 from pathlib import Path
 
+import numpy as np
 import pytest
 
+import mlbatch
 from mlbatch.batch import remote
 from mlbatch.errors import Interrupted, RecordingError
+from mlbatch.rig.recipes import FOLDER
 from tests.batch.network import Cloud, cloud_of
 from tests.batch.sessions import write_dataset
+from tests.builders import datasets as made
+from tests.builders.run import command
 
 
 @pytest.fixture(scope="module")
@@ -128,6 +133,46 @@ def test_shards_of_a_copied_recording(
     )
     assert len(whole) > 2
     assert found == whole
+
+
+def test_files_that_a_recipe_names_are_copied_too(
+    tmp_path: Path, cache: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The calibration of MCD, a folder above its recordings in a store in memory."""
+    obstore = pytest.importorskip("obstore")
+    store = obstore.store.MemoryStore()
+    monkeypatch.setattr(remote, "_store", lambda root: store)
+    monkeypatch.chdir(tmp_path)
+    made.mcd()
+    for path in tmp_path.rglob("*.*"):
+        obstore.put(store, f"mcd/{path.relative_to(tmp_path)}", path)
+    words = ("ntu_day_01", "--dataset", "mcd", "-o", "near.mcap", "--quiet")
+    assert command("convert", *words).code == 0
+    calibration = Path("atv_calib.yaml").read_text(encoding="utf-8")
+    Path("atv_calib.yaml").unlink()
+    url = "s3://data/mcd/ntu_day_01/ntu_day_01_"
+    inputs = f"inputs: [{url}os1_128.bag, {url}mid70.bag]"
+    manifest = f"schema: mlbatch.batch/1\ndataset: mcd\nsessions: [{{name: day, {inputs}}}]\n"
+    Path("many.yaml").write_text(manifest, encoding="utf-8")
+    assert command("batch", "many.yaml", "-o", "out").code == 0
+    for one, other in zip(
+        mlbatch.read("out/day/scans.mcap"), mlbatch.read("near.mcap"), strict=True
+    ):
+        np.testing.assert_array_equal(one.xyz, other.xyz)
+    assert "1 skipped" in command("batch", "many.yaml", "-o", "out").out
+    alone = command("convert", f"{url}os1_128.bag", f"{url}mid70.bag", *words[1:4], "alone.mcap")
+    assert (alone.code, list(Path(cache, "inputs").iterdir())) == (0, [])
+    obstore.put(store, "mcd/atv_calib.yaml", calibration.replace("0.1", "0.3").encode())
+    assert "1 done" in command("batch", "many.yaml", "-o", "out").out
+    assert next(iter(mlbatch.read("out/day/scans.mcap"))).xyz[0, 1] == pytest.approx(1.3)
+    obstore.put(store, "mcd/handheld_calib.yaml", calibration.encode())
+    for found in ("atv_calib.yaml, handheld_calib.yaml", "none"):
+        failed = command("batch", "many.yaml", "-o", "out", "--retry-failed")
+        expected = f"expected one *_calib.yaml in it or a folder above, which {FOLDER}/mcd.yaml"
+        assert expected in failed.err
+        assert f"found {found}; keep that of the recordings there" in failed.err
+        for name in ("atv_calib.yaml", "handheld_calib.yaml"):
+            obstore.delete(store, f"mcd/{name}")
 
 
 def test_a_web_server(cloud: Cloud, tmp_path: Path) -> None:
