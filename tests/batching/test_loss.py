@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 from mlbatch.arrays import BoolArray, I64Array
 from mlbatch.batching.loss import GapLoss, SequenceLoss
 from mlbatch.types import ColumnHeaders
-from tests.builders.rotor import rotor_words
+from tests.builders.decoded import rotor_words
 
 # -- by sequence numbers --------------------------------------------------------------------------
 

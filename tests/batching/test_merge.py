@@ -13,9 +13,6 @@ from mlbatch.arrays import I64Array
 from mlbatch.batching.merge import ColumnMerge
 from mlbatch.lidar.geometry import SECTORS
 from mlbatch.types import NO_COLUMNS, ColumnFigures, Columns, WindowColumns
-from tests.builders.engines import needs_native
-
-pytestmark = needs_native
 
 POSITIONS = (1024, None, 512)
 BASE_NS = 1_700_000_000_000_000_000

@@ -21,7 +21,7 @@ from mlbatch.batching.sweeps import (
     publication_order,
 )
 from mlbatch.units import NS_PER_MS
-from tests.builders.rotor import rotor_words
+from tests.builders.decoded import rotor_words
 
 Spans = list[tuple[int, int, int]]  # (first, last, ready) of sweeps, ms
 

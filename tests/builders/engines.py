@@ -6,12 +6,10 @@ from collections.abc import Sequence
 from dataclasses import fields, replace
 
 import numpy as np
-import pytest
 
 from mlbatch.arrays import F64Array
 from mlbatch.decode.decoder import Decoder, ScanHeader, WindowColumns
 from mlbatch.decode.source import Source
-from mlbatch.native.library import trouble
 from mlbatch.pipeline.conversion import Conversion, SkippedWindow
 from mlbatch.pipeline.job import Job
 from mlbatch.pipeline.session import excluded_boxes_m, limits
@@ -19,9 +17,6 @@ from mlbatch.types import EXTRAS, RunInfo, Scan
 from mlbatch.units import rate_text
 from tests.reference.decoder import LiteralDecoder, check_scan
 
-needs_native = pytest.mark.skipif(
-    bool(trouble()), reason="the compiled library is missing: install mlbatch"
-)
 # Layers of space, in which every sensor has some points.
 BOXES_M = ((-90.0, -90.0, -90.0, 90.0, 90.0, 0.0), (-90.0, -90.0, 0.3, 90.0, 90.0, 1.5))
 _CUT = Job((), min_range_m=2.0, max_range_m=5.0, boxes_m=BOXES_M)

@@ -1,4 +1,4 @@
-"""Packets to be named by their bytes: what facts/*.md say of them, all else zero."""
+"""Packets to be named by their bytes, without readings."""
 
 from __future__ import annotations
 
@@ -8,13 +8,11 @@ from collections.abc import Sequence
 import numpy as np
 
 from mlbatch.arrays import U8Array
+from mlbatch.simulate.robosense.encode import RobosenseSpec
+from mlbatch.simulate.velodyne.encode import VelodyneSpec
+from tests.builders.lidar_packets import even
 
 EE = b"\xff\xee"
-DD = b"\xff\xdd"
-CC = b"\xff\xcc"
-BB = b"\xff\xbb"
-CDEG_PER_US = 0.36  # 600 rpm
-START_CDEG = 35000  # so that streams of a few packets pass zero
 
 
 def rows(payloads: Sequence[bytes]) -> U8Array:
@@ -31,66 +29,38 @@ def filled(size: int, parts: dict[int, bytes]) -> bytes:
     return bytes(payload)
 
 
-def turning(count: int, azimuths: int, row_us: float) -> list[tuple[float, list[int]]]:
-    """(time of the packet in us, azimuths in 0.01 degree, `row_us` apart) of successive packets."""
-    found = []
-    for packet in range(count):
-        begin_us = packet * azimuths * row_us
-        times_us = [begin_us + row * row_us for row in range(azimuths)]
-        found.append((begin_us, [round(START_CDEG + CDEG_PER_US * t) % 36000 for t in times_us]))
-    return found
-
-
 def velodyne_packets(
-    factory: bytes,
-    row_us: float,
-    flags: Sequence[bytes] = (EE,) * 12,
-    azimuths: int = 12,
-    count: int = 8,
-    size: int = 1206,
-    begin_us: int = 3_599_998_000,
+    factory: bytes, model: str, mode: str = "strongest", size: int = 1206, count: int = 8
 ) -> U8Array:
-    """A stream of 12 blocks a packet; blocks share an azimuth where there are fewer of them.
-
-    It passes the full hour, where stamps start over.
-    """
-    payloads = []
-    for time_us, cdeg in turning(count, azimuths, row_us):
-        parts = {
-            100 * block: flag + struct.pack("<H", cdeg[block * azimuths // len(flags)])
-            for block, flag in enumerate(flags)
-        }
-        stamp_us = round(begin_us + time_us) % 3_600_000_000
-        parts[1200] = struct.pack("<I", stamp_us) + factory
-        payloads.append(filled(size, parts))
-    return rows(payloads)
+    """Packets at the pace of a model, with other bytes from 1204 on; they pass the full hour."""
+    spec = VelodyneSpec(model, mode, start_azimuth_deg=350.0, start_us=3_599_998_000.0)
+    payloads = [payload[:1204] + factory for _, payload in even(spec, count, 0, 0)]
+    return rows([payload.ljust(size, b"\0") for payload in payloads])
 
 
 def robosense_packets(
     head: dict[int, bytes],
-    row_us: float = 55.5,
-    azimuths: int = 12,
+    lines: int = 32,
+    mode: str = "strongest",
     *,
     calendar: bool = False,
     count: int = 8,
 ) -> U8Array:
-    """MSOP packets with a header of 42 bytes and 12 blocks of 100."""
-    payloads = []
-    for time_us, cdeg in turning(count, azimuths, row_us):
-        micro = 59_998_500 + round(time_us)  # it passes a full minute
-        second = micro // 1_000_000
-        rest = micro % 1_000_000
-        form = bytes((21, 12, 7, 3, 6 + second // 60, second % 60))
-        time = (
-            form + struct.pack(">HH", rest // 1000, rest % 1000)
-            if calendar
-            else struct.pack(">HII", 0, second, rest)
-        )
-        parts = {20: time, **head}
-        for block in range(12):
-            parts[42 + 100 * block] = EE + struct.pack(">H", cdeg[block * azimuths // 12])
-        payloads.append(filled(1248, parts))
-    return rows(payloads)
+    """MSOP packets with blocks of 100 bytes and this header; their times pass a full minute."""
+    model = {16: "RS-16", 32: "RS-32"}[lines] if calendar else f"Helios {lines}"
+    start_ns = 1_700_000_040 * 10**9 - 1_500_000
+    packets = rows(
+        [
+            data
+            for _, data in even(
+                RobosenseSpec(model, mode, start_deg=350.0, start_ns=start_ns), count, 0, 0
+            )
+        ]
+    )
+    packets[:, [*range(20), 30, 31, 32]] = 0
+    for at, part in head.items():
+        packets[:, at : at + len(part)] = list(part)
+    return packets
 
 
 def livox2_packets(kind: int, point_size: int, points: int, count: int = 3) -> U8Array:

@@ -9,10 +9,14 @@ from functools import cache
 from pathlib import Path
 from typing import cast
 
+import numpy as np
+
 from mlbatch import sensors
+from mlbatch.arrays import U8Array
 from mlbatch.errors import MlbatchError
-from mlbatch.lidar.interface import Evidence
+from mlbatch.lidar.interface import Evidence, NeighbourStream
 from mlbatch.sensors import Plugin, Vendor
+from mlbatch.types import Stream
 
 
 @cache
@@ -56,3 +60,26 @@ def _is_known(plugin: Plugin, path: Path, content: bytes) -> bool:
         return plugin.read_calibration(path, content) is not None
     except MlbatchError:
         return True
+
+
+LACKING = ": no decoder in this version"
+
+
+def named(packets: U8Array) -> str | None:
+    """What the vendors but Ouster, which names packets by their sizes, call payloads (k, size).
+
+    A vendor that names them must not exclude them.
+    """
+    size = packets.shape[1]
+    for _, folder, plugin in vendors():
+        name = None if plugin.VENDOR == "Ouster" else plugin.describe(size, packets)
+        if name is not None:
+            assert folder.may_send(size, packets), name
+            return name
+    return None
+
+
+def beside(stream: Stream, payload: bytes) -> NeighbourStream:
+    """One packet from the same source."""
+    sample = np.frombuffer(payload, np.uint8)[None]
+    return NeighbourStream(stream, len(payload), sample, np.zeros(1, np.int64))

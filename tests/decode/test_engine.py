@@ -43,8 +43,8 @@ from mlbatch.writers.point_layouts import (
     ROWS_TIME,
 )
 from tests.builders import every_model as models
+from tests.builders.decoded import rotor_words
 from tests.builders.engines import BOXES_M, MOST_COLUMNS, Pair, assert_same
-from tests.builders.rotor import rotor_words
 from tests.builders.spinning import ouster_calibration
 from tests.contract.tree import PACKAGE
 from tests.reference.decoder import readings_of, record_of

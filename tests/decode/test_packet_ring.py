@@ -11,10 +11,7 @@ from mlbatch.arrays import I64Array, U8Array
 from mlbatch.decode.packet_ring import PacketRing
 from mlbatch.lidar.interface import Records
 from mlbatch.native.arena import PacketArena
-from tests.builders.engines import needs_native
 from tests.reference.decoder import record_of
-
-pytestmark = needs_native
 
 SIZE = 40
 # Four columns of 9 bytes from byte 4, two in a row.

@@ -14,8 +14,7 @@ from mlbatch.lidar.geometry import (
     read_rotor_words,
     spherical,
 )
-from tests.builders.decoded import Rotor, projected
-from tests.builders.rotor import rotor_words
+from tests.builders.decoded import Rotor, projected, rotor_words
 
 
 def test_a_beam_to_the_right_at_a_quarter_revolution() -> None:

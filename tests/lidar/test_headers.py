@@ -17,12 +17,9 @@ from mlbatch.lidar.interface import Lidar
 from mlbatch.sensors.ouster.profiles import FUSA, PROFILES, STANDARD
 from mlbatch.simulate.ouster.encode import OusterSpec
 from mlbatch.simulate.velodyne.encode import VelodyneSpec
-from tests.builders.engines import needs_native
 from tests.builders.headers import check_headers, ouster_packets
 from tests.builders.spinning import stream_of
 from tests.contract.test_models import cases
-
-pytestmark = needs_native
 
 SERIAL = 122201000998
 OUSTER = tuple(

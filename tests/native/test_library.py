@@ -15,7 +15,6 @@ import mlbatch
 from mlbatch import native
 from mlbatch.errors import UsageError
 from mlbatch.native import library, require_library
-from tests.builders.engines import needs_native
 from tests.builders.run import TWO_LIDARS, command
 from tests.contract.tree import PACKAGE
 
@@ -100,7 +99,6 @@ def test_a_damaged_library_is_not_used(tmp_path: Path, monkeypatch: pytest.Monke
         require_library()
 
 
-@needs_native
 @pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler")
 @pytest.mark.usefixtures("_fresh")
 def test_a_library_of_another_version_is_not_used(
@@ -133,7 +131,6 @@ def test_the_sources_have_no_warnings(tmp_path: Path) -> None:
     assert (done.returncode, done.stderr) == (0, "")
 
 
-@needs_native
 @pytest.mark.parametrize("name", ["auto", "numpy", "native"])
 def test_the_engine_is_ignored_with_a_note(name: str) -> None:
     capture = TWO_LIDARS / "two_lidars.pcap"

@@ -14,7 +14,7 @@ import numpy.typing as npt
 from mlbatch.arrays import U8Array
 from mlbatch.lidar.interface import Evidence
 from mlbatch.types import Stream
-from tests.builders.streams import beside
+from tests.builders.vendors import beside
 from tests.recordings import RECORDINGS
 
 OUSTER = RECORDINGS / "ouster"

@@ -42,7 +42,7 @@ from mlbatch.types import StreamTable
 from tests.builders.engines import check_conversion
 from tests.builders.loss import Came
 from tests.builders.run import command
-from tests.builders.streams import named
+from tests.builders.vendors import named
 from tests.contract.tree import ROOT
 from tests.golden.digest_outputs import Digests
 from tests.recordings import RECORDINGS

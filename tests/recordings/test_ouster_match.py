@@ -10,7 +10,7 @@ import pytest
 from mlbatch.sensors import describe, read_calibration
 from mlbatch.sensors.ouster.sensor import OusterCalibration
 from mlbatch.types import Stream
-from tests.builders.streams import beside
+from tests.builders.vendors import beside
 from tests.recordings.ouster import (
     CASES,
     ONLY_IMU,

@@ -16,9 +16,6 @@ from mlbatch.sensors.livox import sensor as livox
 from mlbatch.sensors.robosense.identify import identify
 from mlbatch.sensors.robosense.models import BPEARL_V3, BPEARL_V4, HELIOS_16, HELIOS_32, Model
 from tests.builders.others import (
-    BB,
-    CC,
-    DD,
     EE,
     filled,
     livox1_packets,
@@ -27,7 +24,7 @@ from tests.builders.others import (
     rows,
     velodyne_packets,
 )
-from tests.builders.streams import LACKING, named
+from tests.builders.vendors import LACKING, named
 
 Parts = Mapping[int, bytes]
 
@@ -45,82 +42,69 @@ def check(table: Sequence[tuple[U8Array, str | None]]) -> None:
 
 # -- Velodyne: docs/sources/velodyne.md sections 1 and 2, others.md -------------------------------
 
-# Time between the azimuths of a model, us.
-VLP_16_US, HDL_32E_US, VLP_32C_US = 110.592, 46.080, 55.296
-BANKS, TWICE = (EE, DD, CC, BB) * 3, (EE, EE, DD, DD, CC, CC, BB, BB)
-
 
 @pytest.mark.parametrize(
-    ("product", "row_us", "model", "lack"),
+    ("product", "pace", "model", "lack"),
     [
-        (0x21, HDL_32E_US, "HDL-32E", ""),
-        (0x22, VLP_16_US, "VLP-16", ""),
+        (0x21, "HDL-32E", "HDL-32E", ""),
+        (0x22, "VLP-16", "VLP-16", ""),
         # Models that the sheet has no beams or no layout of.
-        (0x23, VLP_32C_US, "VLP-32A/B", LACKING),
-        (0x24, VLP_16_US, "Puck Hi-Res", ""),
-        (0x28, VLP_32C_US, "VLP-32C", ""),
-        (0x31, VLP_32C_US, "Velarray", LACKING),
+        (0x23, "VLP-32C", "VLP-32A/B", LACKING),
+        (0x24, "VLP-16", "Puck Hi-Res", ""),
+        (0x28, "VLP-32C", "VLP-32C", ""),
+        (0x31, "VLP-32C", "Velarray", LACKING),
     ],
 )
-@pytest.mark.parametrize(
-    ("mode", "azimuths", "returns"),
-    [(0x37, 12, "strongest return"), (0x38, 12, "last return"), (0x39, 6, "dual return")],
-)
-def test_velodyne(
-    product: int, row_us: float, model: str, lack: str, mode: int, azimuths: int, returns: str
-) -> None:
-    packets = velodyne_packets(bytes((mode, product)), row_us, azimuths=azimuths)
-    name = f"Velodyne lidar {model}, {returns}{lack}"
+@pytest.mark.parametrize(("byte", "mode"), [(0x37, "strongest"), (0x38, "last"), (0x39, "dual")])
+def test_velodyne(product: int, pace: str, model: str, lack: str, byte: int, mode: str) -> None:
+    packets = velodyne_packets(bytes((byte, product)), pace, mode)
+    name = f"Velodyne lidar {model}, {mode} return{lack}"
     check([(packets, name), (packets[:1], name)])
 
 
-@pytest.mark.parametrize(("mode", "azimuths", "word"), [(0x37, 12, "strongest"), (0x39, 6, "dual")])
-def test_a_product_byte_contradicted_by_the_pace(mode: int, azimuths: int, word: str) -> None:
-    for product, row_us, model, other in (
-        (0x21, VLP_16_US, "VLP-16", "HDL-32E"),
-        (0x22, HDL_32E_US, "HDL-32E", "VLP-16"),
-    ):
-        packets = velodyne_packets(bytes((mode, product)), row_us, azimuths=azimuths, count=16)
-        name = f"Velodyne lidar {model} (its product byte says {other}), {word} return"
+@pytest.mark.parametrize(("byte", "mode"), [(0x37, "strongest"), (0x39, "dual")])
+def test_a_product_byte_contradicted_by_the_pace(byte: int, mode: str) -> None:
+    for product, model, other in ((0x21, "VLP-16", "HDL-32E"), (0x22, "HDL-32E", "VLP-16")):
+        packets = velodyne_packets(bytes((byte, product)), model, mode, count=16)
+        name = f"Velodyne lidar {model} (its product byte says {other}), {mode} return"
         # Also if packets are lost; a single one cannot contradict.
         check([(packets[::every], name) for every in (1, 2, 3)])
-        check([(packets[:1], f"Velodyne lidar {other}, {word} return")])
+        check([(packets[:1], f"Velodyne lidar {other}, {mode} return")])
 
 
 def test_other_packets_of_velodyne() -> None:
-    unset = "(its factory bytes are not set)"
-    for azimuths, word in ((12, "single"), (6, "dual")):
+    for mode, word in (("strongest", "single"), ("dual", "dual")):
         check(
             [
-                (velodyne_packets(b"\0\0", row_us, azimuths=azimuths), f"{name}, {word} return")
-                for row_us, name in (
-                    (VLP_16_US, f"Velodyne lidar VLP-16 {unset}"),
-                    (HDL_32E_US, f"Velodyne lidar HDL-32E {unset}"),
+                (
+                    velodyne_packets(b"\0\0", model, mode),
+                    f"Velodyne lidar {model} (its factory bytes are not set), {word} return",
                 )
+                for model in ("VLP-16", "HDL-32E")
             ]
         )
     like = "Velodyne-like lidar, factory bytes"
     check(
         [
-            (velodyne_packets(b"\0\0", VLP_32C_US), f"{like} 00 00{LACKING}"),
-            (velodyne_packets(b"\x37\x10", VLP_16_US), f"{like} 37 10{LACKING}"),
+            (velodyne_packets(b"\0\0", "VLP-32C"), f"{like} 00 00{LACKING}"),
+            (velodyne_packets(b"\x37\x10", "VLP-16"), f"{like} 37 10{LACKING}"),
         ]
     )
-    # A VLS-128 by its four banks, an HDL-64E by its two; its last bytes are a status.
+    # A VLS-128 by its four banks, an HDL-64E by two; the last bytes of that are a status.
     for product in (0xA1, 0x63):
         check(
             [
-                (velodyne_packets(bytes((mode, last)), 55.3, banks, azimuths=azimuths), name)
-                for mode, last, banks, azimuths, name in (
-                    (0x38, product, BANKS, 3, "Velodyne lidar VLS-128, last return"),
-                    (0x39, product, TWICE, 1, "Velodyne lidar VLS-128, dual return"),
-                    (0, 0, BANKS, 3, "Velodyne lidar VLS-128, single return"),
-                    (0, 0, TWICE, 1, "Velodyne lidar VLS-128, dual return"),
+                (velodyne_packets(bytes((byte, last)), "VLS-128", mode), f"Velodyne lidar {name}")
+                for byte, last, mode, name in (
+                    (0x38, product, "last", "VLS-128, last return"),
+                    (0x39, product, "dual", "VLS-128, dual return"),
+                    (0, 0, "last", "VLS-128, single return"),
+                    (0, 0, "dual", "VLS-128, dual return"),
                 )
             ]
         )
-    for azimuths, word in ((6, "single"), (3, "dual")):
-        packets = velodyne_packets(b"\0\0", 57.6, (EE, DD) * 6, azimuths=azimuths)
+    for mode, word in (("last", "single"), ("dual", "dual")):
+        packets = velodyne_packets(b"\0\0", "HDL-64E S3", mode)
         packets[:, 1204:] = np.frombuffer(b"HaMbScDdNeYfGgTh", np.uint8).reshape(8, 2)
         check([(packets, f"Velodyne lidar HDL-64E, {word} return")])
 
@@ -224,21 +208,20 @@ RUBY = [
 def test_robosense(head: bytes, types: str, lines: int, calendar: bool, model: str) -> None:
     """A dual 16-line block is one round, a single one two; dual 32-line blocks come in pairs."""
     parts = {0: head, 30: bytes.fromhex(types)}
-    single = robosense_packets(parts, 111.1 if lines == 16 else 55.5, calendar=calendar)
-    dual = robosense_packets(parts, 55.5, 12 if lines == 16 else 6, calendar=calendar)
-    check([(single, f"ROBOSENSE lidar {model}, single return")])
-    check([(dual, f"ROBOSENSE lidar {model}, dual return")])
+    for mode, word in (("strongest", "single"), ("dual", "dual")):
+        packets = robosense_packets(parts, lines, mode, calendar=calendar)
+        check([(packets, f"ROBOSENSE lidar {model}, {word} return")])
 
 
 @pytest.mark.parametrize("types", ["060000", "000600", "060609"])
 def test_helios_without_a_model_is_identified_by_the_time_of_its_blocks(types: str) -> None:
     """A block is a round of 32 lines, or two of 16; one of 16 with two returns takes as long."""
     head = {0: SECOND, 30: bytes.fromhex(types)}
-    wide = robosense_packets(head, 55.5)
+    wide = robosense_packets(head)
     check(
         [
-            (robosense_packets(head, 111.1), "ROBOSENSE lidar Helios 16, single return"),
-            (robosense_packets(head, 55.5, 6), "ROBOSENSE lidar Helios 32, dual return"),
+            (robosense_packets(head, 16), "ROBOSENSE lidar Helios 16, single return"),
+            (robosense_packets(head, 32, "dual"), "ROBOSENSE lidar Helios 32, dual return"),
             (wide, "ROBOSENSE lidar Helios 32, single return"),
         ]
     )
@@ -315,7 +298,7 @@ def test_device_packets_and_damaged_ones_between_points_do_not_hide_them() -> No
 # -- single packets -------------------------------------------------------------------------------
 
 NAMES: list[tuple[U8Array, str | None]] = [
-    (velodyne_packets(b"", VLP_16_US, size=1212), "LSLIDAR-like, 1212 bytes: not supported"),
+    (velodyne_packets(b"", "VLP-16", size=1212), "LSLIDAR-like, 1212 bytes: not supported"),
     *(
         (one(size, {0: bytes.fromhex("a5ff005a")}), "LSLIDAR device packet")
         for size in (1206, 1212)

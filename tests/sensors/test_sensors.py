@@ -20,7 +20,7 @@ from tests.builders.others import (
     rows,
     velodyne_packets,
 )
-from tests.builders.streams import named
+from tests.builders.vendors import named
 
 
 def test_the_models_of_ouster() -> None:
@@ -65,7 +65,7 @@ def test_no_vendor_knows_an_odd_packet() -> None:
 def test_a_damaged_packet_does_not_hide_a_stream() -> None:
     xt16 = filled(568, {0: bytes.fromhex("eeff06010000100801040201"), 550: b"\x37"})
     streams = [
-        velodyne_packets(b"\x37\x22", 110.592),
+        velodyne_packets(b"\x37\x22", "VLP-16"),
         rows([xt16] * 2),
         livox2_packets(1, 14, 96),
     ]

@@ -18,8 +18,7 @@ from mlbatch.lidar.interface import Evidence
 from mlbatch.sensors.ouster.profiles import PROFILES, PacketLayout
 from mlbatch.types import Stream
 from tests.builders.others import livox1_packets, rows
-from tests.builders.streams import named
-from tests.builders.vendors import vendors, wrongly_excluded
+from tests.builders.vendors import named, vendors, wrongly_excluded
 from tests.fuzz.decoding import sampled
 from tests.fuzz.framing import parts_of
 from tests.fuzz.packets import CALIBRATION, seeds_of

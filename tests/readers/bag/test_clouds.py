@@ -16,7 +16,6 @@ from mlbatch.readers.bag.clouds import CloudRecording
 from mlbatch.reports.ledger import check_capture
 from mlbatch.types import PacketBatch, Stream, StreamTable, Topic
 from tests.builders.bags import Body, Recorded, packet_message
-from tests.builders.engines import needs_native
 from tests.builders.points import (
     CLOUD,
     CUSTOM2,
@@ -128,7 +127,6 @@ def test_rings_beyond_those_of_the_first_cloud_are_reported(tmp_path: Path) -> N
     assert fault.endswith("the first: expected rings as in the first cloud, found none")
 
 
-@needs_native
 def test_a_search_for_sensors_packs_first_points_and_the_run_all(tmp_path: Path) -> None:
     """By hand: 256 columns of 16 rings, by column; 512 points are 32 columns."""
     points = [(1, 1, ring, 9, 1000 * column, ring) for column in range(256) for ring in range(16)]
@@ -145,7 +143,6 @@ def test_a_search_for_sensors_packs_first_points_and_the_run_all(tmp_path: Path)
     assert recording.counts.frames == 3 * 256
 
 
-@needs_native
 def test_clouds_without_a_place_at_first_are_searched_whole(tmp_path: Path) -> None:
     points = [
         (ring > 1, 0, 0, 9, 1000 * column, ring) for ring in range(16) for column in range(256)

@@ -11,8 +11,7 @@ import pytest
 from mlbatch.arrays import I64Array
 from mlbatch.sensors.hesai.angles import At128File
 from mlbatch.sensors.hesai.projections import at128_projection
-from tests.builders.decoded import Rotor, projected
-from tests.builders.rotor import rotor_words
+from tests.builders.decoded import Rotor, projected, rotor_words
 
 DEG = math.pi / 180
 CHANNELS = 128

@@ -18,7 +18,7 @@ from mlbatch.simulate.ouster.encode import OusterSpec, encode_packets, imu_packe
 from mlbatch.types import Stream
 from tests.builders.others import rows
 from tests.builders.spinning import ouster_calibration
-from tests.builders.streams import beside
+from tests.builders.vendors import beside
 
 
 def packets_of(spec: OusterSpec, columns: int = 32) -> U8Array:

@@ -17,7 +17,6 @@ from mlbatch.ros.point_packets import Layout, Points, layout_of, pack
 from mlbatch.sensors.pointcloud.sensor import BUILT_IN, MODELS, CloudLidar
 from mlbatch.types import Stream
 from tests.builders.decoded import readings
-from tests.builders.engines import needs_native
 from tests.builders.headers import check_headers
 from tests.builders.points import STAMP_NS, VELODYNE, cloud_message, write_points
 from tests.builders.rosbag2 import write_rosbag2
@@ -193,7 +192,6 @@ def _by_ring() -> tuple[Lidar, U8Array]:
     return CloudLidar(layout, "/top"), packets
 
 
-@needs_native
 def test_headers_say_what_packets_literally_say() -> None:
     """Each packet is a column; of another layout it is damage; times may fall."""
     lidar, packets = _by_ring()
@@ -204,7 +202,6 @@ def test_headers_say_what_packets_literally_say() -> None:
     assert check_headers(lidar, packets, HOST_NS).faults.any()
 
 
-@needs_native
 def test_hashes_that_are_known_are_used() -> None:
     lidar, packets = _by_ring()
     keys = np.arange(40)

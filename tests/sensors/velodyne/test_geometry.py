@@ -19,8 +19,7 @@ from mlbatch.sensors.velodyne.packets import hdl64_projection
 from mlbatch.sensors.velodyne.sensor import VelodyneCalibration
 from mlbatch.simulate.velodyne.encode import VelodyneSpec
 from mlbatch.simulate.velodyne.models import MODELS, calibration_yaml
-from tests.builders.decoded import Rotor, projected
-from tests.builders.rotor import rotor_words
+from tests.builders.decoded import Rotor, projected, rotor_words
 from tests.builders.spinning import PLAIN, from_file, pointing, stream_of
 
 LASERS = 64
