@@ -12,8 +12,8 @@ import numpy as np
 
 from mlbatch.arrays import F32Array, F64Array, U8Array
 from mlbatch.decode.engine import Engine
+from mlbatch.decode.groups import Source
 from mlbatch.decode.scan_buffer import ScanBuffer, by_time
-from mlbatch.decode.source import Source
 from mlbatch.reports.ledger import PointCounts
 from mlbatch.types import (
     EXTRAS,

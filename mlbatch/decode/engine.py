@@ -10,10 +10,9 @@ import numpy as np
 import numpy.typing as npt
 
 from mlbatch.arrays import F32Array, F64Array, I64Array
-from mlbatch.decode.groups import CORRECTED, MIRRORED, TURNING, SensorGroup, group_key
+from mlbatch.decode.groups import CORRECTED, MIRRORED, TURNING, SensorGroup, Source, group_key
 from mlbatch.decode.records import RecordPacker
 from mlbatch.decode.scan_buffer import ScanBuffer
-from mlbatch.decode.source import Source
 from mlbatch.lidar.geometry import angles_rad, rotor_angles
 from mlbatch.native.library import Group, Scan, address, library
 from mlbatch.reports.ledger import PointCounts

@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import ctypes
 from collections.abc import Hashable, Sequence
+from dataclasses import dataclass
 from typing import Any, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
 
 from mlbatch.arrays import F32Array, F64Array, I64Array
+from mlbatch.decode.packet_ring import PacketRing
 from mlbatch.decode.scan_buffer import LABEL
-from mlbatch.decode.source import Source
 from mlbatch.errors import RigError
 from mlbatch.lidar.geometry import (
     BeamTable,
@@ -43,6 +44,28 @@ _TYPE_BITS = np.uint64(0xFF << 48)
 _REVOLUTION = 2 * np.pi
 
 Geometry: TypeAlias = BeamTable | OffAxis | CorrectedRanges | Mirrors | PlacedPoints | Coordinates
+
+
+@dataclass(slots=True)
+class Source:
+    """Lidar, raw packets, pose and limits of a sensor.
+
+    body_from_sensor: (4, 4) float64, m; ring_base: number of its first channel in the output;
+    keep_repeated: keep duplicate returns.
+    """
+
+    lidar: Lidar
+    ring: PacketRing
+    body_from_sensor: F64Array
+    ring_base: int
+    min_range_m: float = 0.0
+    max_range_m: float = float("inf")
+    keep_repeated: bool = False
+
+    @property
+    def slots(self) -> int:
+        """Slots of a column: channels times returns."""
+        return self.lidar.channels * self.lidar.returns
 
 
 class SensorGroup:

@@ -10,8 +10,8 @@ from mlbatch.batching.fill import Pace
 from mlbatch.batching.intake import Intake
 from mlbatch.clocks.timescale import timescale
 from mlbatch.clocks.watch import ClockWatch
+from mlbatch.decode.groups import Source
 from mlbatch.decode.packet_ring import PacketRing
-from mlbatch.decode.source import Source
 from mlbatch.discovery.types import DetectedSensor
 from mlbatch.lidar.interface import Lidar
 from mlbatch.native.arena import PacketArena

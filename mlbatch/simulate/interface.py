@@ -1,18 +1,22 @@
 """The interface of a simulated lidar: rays of its shots, and packets of measured distances.
 
-The module `lidar` in the folder of a vendor offers it. Columns are sent in chunks of constant
+The module `encode` in the folder of a vendor offers it. Columns are sent in chunks of constant
 length, so that recordings of any length need constant memory; the number of a chunk determines its
 columns.
 """
 
 from __future__ import annotations
 
+import importlib
+import pkgutil
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Protocol
+from functools import lru_cache
+from typing import Protocol, cast
 
 import numpy as np
 
+import mlbatch.simulate
 from mlbatch.arrays import BoolArray, F64Array, I64Array
 
 
@@ -135,9 +139,9 @@ class SimulatedLidar(Protocol):
 
 
 class Simulator(Protocol):
-    """Interface of the module `lidar` of a vendor."""
+    """Interface of the module `encode` of a vendor."""
 
-    MODELS: tuple[LidarModel, ...]
+    LIDARS: tuple[LidarModel, ...]
 
     def simulated(self, settings: LidarSettings) -> SimulatedLidar:
         """Return the lidar."""
@@ -149,3 +153,26 @@ def whole_counts(distance_m: F64Array, unit_m: float, largest: int) -> I64Array:
     counts = distance_m * (1.0 / unit_m)
     fits = (counts >= 0.5) & (counts < largest + 0.5)
     return np.rint(np.where(fits, counts, 0.0)).astype(np.int64)
+
+
+@lru_cache(maxsize=1)
+def _simulators() -> Mapping[str, tuple[LidarModel, Simulator]]:
+    """Return all models by name, with the module of each."""
+    found = {}
+    for vendor in pkgutil.iter_modules(mlbatch.simulate.__path__):
+        if not vendor.ispkg:
+            continue
+        name = f"{mlbatch.simulate.__name__}.{vendor.name}.encode"
+        simulator = cast(Simulator, importlib.import_module(name))
+        found.update({model.name: (model, simulator) for model in simulator.LIDARS})
+    return found
+
+
+def lidar_models() -> Mapping[str, LidarModel]:
+    """Return all models by name."""
+    return {name: model for name, (model, _) in _simulators().items()}
+
+
+def simulated_lidar(settings: LidarSettings) -> SimulatedLidar:
+    """Return a lidar of one of the models."""
+    return _simulators()[settings.model][1].simulated(settings)

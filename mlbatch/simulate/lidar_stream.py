@@ -8,8 +8,7 @@ import numpy as np
 
 from mlbatch.arrays import F64Array, I64Array
 from mlbatch.motion.se3 import skew
-from mlbatch.simulate.interface import Sent, Shots
-from mlbatch.simulate.models import simulated_lidar
+from mlbatch.simulate.interface import Sent, Shots, simulated_lidar
 from mlbatch.simulate.rays import Rays
 from mlbatch.simulate.scenario import Clock, ImuErrors, LidarPlan, Scenario
 from mlbatch.simulate.scene import Scene

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -16,19 +16,12 @@ from typing import IO
 
 import numpy as np
 
+from mlbatch.arrays import F64Array
 from mlbatch.errors import UsageError
 from mlbatch.frames.transforms import quaternion, rpy_deg
+from mlbatch.ros.encoding import Cdr
 from mlbatch.ros.packet_writing import PacketMessages, Stamped
 from mlbatch.simulate.lidar_stream import LidarStream, Received, SensorClock, with_errors
-from mlbatch.simulate.messages import (
-    TF,
-    TF_STATIC,
-    imu_message,
-    odometry_message,
-    static_message,
-    text_message,
-    transform_message,
-)
 from mlbatch.simulate.scenario import Scenario
 from mlbatch.simulate.trajectory import Poses
 from mlbatch.types import Message, Topic
@@ -45,6 +38,9 @@ _IMU_LATENCY_NS = 500_000
 _RANDOM_OF_IMU = 1_000_000
 _RANK_OF_TRUTH = -2
 _RANK_OF_IMU = -1
+TF = "/tf"
+TF_STATIC = "/tf_static"
+_UNKNOWN = (-1.0, *(0.0,) * 8)
 
 
 @dataclass(frozen=True, slots=True)
@@ -287,10 +283,13 @@ class _Run:
         if self._bag is None:
             return
         plan = self._scenario.truth
-        is_transform = plan.topic == TF
-        encode = transform_message if is_transform else odometry_message
-        kind = "tf2_msgs/TFMessage" if is_transform else "nav_msgs/Odometry"
-        data = encode(host_ns, plan.frame, self._scenario.body_frame, poses, row)
+        names = plan.frame, self._scenario.body_frame
+        if plan.topic == TF:
+            kind = "tf2_msgs/TFMessage"
+            data = transform_message(host_ns, *names, poses.position_m[row], poses.rotation[row])
+        else:
+            kind = "nav_msgs/Odometry"
+            data = odometry_message(host_ns, *names, poses, row)
         self._send(plan.topic, kind, host_ns, data)
 
     def _write_metadata(self) -> None:
@@ -301,7 +300,8 @@ class _Run:
         start_ns = self._scenario.start_ns
         if imu is not None:
             body = self._scenario.body_frame
-            data = static_message(start_ns, body, imu.name, imu.body_from_imu)
+            pose = imu.body_from_imu
+            data = transform_message(start_ns, body, imu.name, pose[:3, 3], pose[:3, :3])
             self._send(TF_STATIC, "tf2_msgs/TFMessage", start_ns, data, latched=True)
         for stream in self._streams:
             files = stream.lidar.files
@@ -352,3 +352,48 @@ def _side_files(scenario: Scenario, streams: list[LidarStream], target: Path) ->
     ]
     text = "\n".join([*head, "sensors:", *sensors]) + "\n"
     return {_with_suffix(target, "rig.yaml"): text.encode(), **found}
+
+
+# -- ROS 2 messages (CDR); types: docs/sources/messages.md, section 1 ------------------------------
+
+
+def text_message(text: str) -> bytes:
+    """Return a std_msgs/String."""
+    message = Cdr()
+    message.text(text)
+    return bytes(message.data)
+
+
+def imu_message(stamp_ns: int, frame: str, force: Sequence[float], rate: Sequence[float]) -> bytes:
+    """Return a sensor_msgs/Imu: m/s2 and rad/s, frame of the IMU, without orientation."""
+    message = Cdr()
+    message.header(stamp_ns, frame)
+    message.put("d", 0.0, 0.0, 0.0, 1.0, *_UNKNOWN)
+    message.put("d", *rate, *(0.0,) * 9)
+    message.put("d", *force, *(0.0,) * 9)
+    return bytes(message.data)
+
+
+def transform_message(
+    stamp_ns: int, parent: str, child: str, place_m: F64Array, rotation: F64Array
+) -> bytes:
+    """Return a tf2_msgs/TFMessage of a pose: (3,) and (3, 3)."""
+    message = Cdr()
+    message.put("I", 1)
+    message.header(stamp_ns, parent)
+    message.text(child)
+    message.put("d", *place_m.tolist())
+    message.put("d", *quaternion(rotation))
+    return bytes(message.data)
+
+
+def odometry_message(stamp_ns: int, parent: str, child: str, poses: Poses, row: int) -> bytes:
+    """Return a nav_msgs/Odometry of the pose of the body; twist in the frame of the body."""
+    message = Cdr()
+    message.header(stamp_ns, parent)
+    message.text(child)
+    message.put("d", *poses.position_m[row].tolist())
+    message.put("d", *quaternion(poses.rotation[row]), *(0.0,) * 36)
+    message.put("d", *(poses.rotation[row].T @ poses.velocity[row]).tolist())
+    message.put("d", *poses.angular_velocity[row].tolist(), *(0.0,) * 36)
+    return bytes(message.data)

@@ -22,8 +22,7 @@ from mlbatch.rig.rig import MAX_NAME
 from mlbatch.rig.yaml_tree import Node, read_yaml
 from mlbatch.simulate.foliage import Crowns
 from mlbatch.simulate.forest import CrownPlan, Forest, Row, grown
-from mlbatch.simulate.interface import LidarModel, LidarSettings
-from mlbatch.simulate.models import lidar_models
+from mlbatch.simulate.interface import LidarModel, LidarSettings, lidar_models
 from mlbatch.simulate.scene import Boxes, Rectangles, Scene, Stems, Swing
 from mlbatch.simulate.terrain import Terrain, rough_terrain
 from mlbatch.simulate.trajectory import (

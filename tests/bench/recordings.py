@@ -27,8 +27,7 @@ from typing import Final
 import numpy as np
 
 from mlbatch.arrays import F64Array
-from mlbatch.simulate.interface import LidarSettings, Sent, SimulatedLidar
-from mlbatch.simulate.models import simulated_lidar
+from mlbatch.simulate.interface import LidarSettings, Sent, SimulatedLidar, simulated_lidar
 from mlbatch.types import Message, Topic
 from mlbatch.units import NS_PER_MS, NS_PER_S, NS_PER_US, STANDARD_GRAVITY
 from mlbatch.writers.recordings import McapFile

@@ -10,8 +10,7 @@ import numpy as np
 
 from mlbatch.arrays import F32Array, F64Array, I64Array, U8Array, U16Array
 from mlbatch.decode.decoder import Decoder, ScanHeader, WindowColumns
-from mlbatch.decode.groups import slot_numbers
-from mlbatch.decode.source import Source
+from mlbatch.decode.groups import Source, slot_numbers
 from mlbatch.lidar.geometry import BeamTable, Projection
 from mlbatch.lidar.interface import BitField, ChannelRun, Lidar, PixelTable, Records, ReturnLayout
 from mlbatch.native.arena import PacketArena

@@ -9,7 +9,7 @@ import numpy as np
 
 from mlbatch.arrays import F64Array
 from mlbatch.decode.decoder import Decoder, ScanHeader, WindowColumns
-from mlbatch.decode.source import Source
+from mlbatch.decode.groups import Source
 from mlbatch.pipeline.conversion import Conversion, SkippedWindow
 from mlbatch.pipeline.job import Job
 from mlbatch.pipeline.session import excluded_boxes_m, limits

@@ -16,8 +16,8 @@ import numpy as np
 from mlbatch.discovery.discover import SensorSelection
 from mlbatch.pipeline.job import Job
 from mlbatch.simulate.hesai import models as hesai_models
+from mlbatch.simulate.hesai.encode import LIDARS as HESAIS
 from mlbatch.simulate.hesai.encode import HesaiSpec
-from mlbatch.simulate.hesai.lidar import MODELS as HESAIS
 from mlbatch.simulate.robosense import models as robosense_models
 from mlbatch.simulate.robosense.encode import START_NS, RobosenseSpec
 from mlbatch.simulate.spinning import SpinningSpec

@@ -54,7 +54,7 @@ NEEDLESS = (
     *("mlbatch.writers.formats.rosbag1", "mlbatch.cli.compare"),
     *("mlbatch.cli.inspect", "mlbatch.cli.verify", "mlbatch.cli.report", "mlbatch.page.document"),
     *("mlbatch.cli.simulate", "mlbatch.simulate.recording", "mlbatch.simulate.ouster.encode"),
-    *("mlbatch.simulate.ouster.lidar", "mlbatch.simulate.interface"),
+    *("mlbatch.simulate.interface"),
     *("mlbatch.cli.batch", "mlbatch.cli.convert_remote", "mlbatch.batch.task"),
     *("mlbatch.cli.digest", "mlbatch.digests.golden"),
     *("mlbatch.pipeline.deskew", "mlbatch.motion.se3", "mlbatch.pipeline.merge"),

@@ -10,7 +10,7 @@ import pytest
 
 from mlbatch.arrays import F64Array
 from mlbatch.decode.decoder import Decoder, ScanHeader, WindowColumns
-from mlbatch.decode.source import Source
+from mlbatch.decode.groups import Source
 from mlbatch.frames.transforms import from_rpy_deg
 from mlbatch.native.arena import PacketArena
 from mlbatch.pipeline.sensor import new_ring

@@ -20,9 +20,9 @@ from mlbatch.arrays import I64Array
 from mlbatch.decode import decoder as decode
 from mlbatch.decode import engine
 from mlbatch.decode.decoder import Decoder, ScanHeader, WindowColumns
+from mlbatch.decode.groups import Source
 from mlbatch.decode.packet_ring import PacketRing
 from mlbatch.decode.scan_buffer import LABEL, ScanBuffer
-from mlbatch.decode.source import Source
 from mlbatch.frames.transforms import from_rpy_deg
 from mlbatch.lidar.geometry import BeamTable
 from mlbatch.lidar.interface import Lidar

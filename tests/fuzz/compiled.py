@@ -18,8 +18,8 @@ import numpy as np
 from mlbatch.arrays import U8Array
 from mlbatch.batching.merge import ColumnMerge
 from mlbatch.decode.decoder import ScanHeader
+from mlbatch.decode.groups import Source
 from mlbatch.decode.packet_ring import PacketRing
-from mlbatch.decode.source import Source
 from mlbatch.lidar.headers import content_keys, hash_factors
 from mlbatch.lidar.interface import Lidar
 from mlbatch.native.arena import PacketArena

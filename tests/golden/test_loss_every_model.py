@@ -21,7 +21,7 @@ from mlbatch.sensors import parse_calibration
 from mlbatch.simulate.hesai.encode import HesaiSpec
 from mlbatch.simulate.hesai.models import MODELS as HESAIS
 from mlbatch.simulate.hesai.models import SEQUENCE
-from mlbatch.simulate.models import lidar_models
+from mlbatch.simulate.interface import lidar_models
 from mlbatch.simulate.robosense.encode import RobosenseSpec
 from mlbatch.simulate.robosense.models import MODELS as ROBOSENSES
 from mlbatch.simulate.spinning import SpinningSpec

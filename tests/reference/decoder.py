@@ -17,8 +17,8 @@ from typing import TypeAlias
 import numpy as np
 
 from mlbatch.arrays import F64Array, I64Array, U8Array
+from mlbatch.decode.groups import Source
 from mlbatch.decode.packet_ring import PacketRing
-from mlbatch.decode.source import Source
 from mlbatch.lidar.geometry import (
     BeamTable,
     Coordinates,

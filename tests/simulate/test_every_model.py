@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mlbatch.simulate.models import lidar_models
+from mlbatch.simulate.interface import lidar_models
 from tests.builders.simulated import (
     record,
     residuals,

@@ -32,8 +32,8 @@ from mlbatch.simulate.hesai.models import (
     UNIT_FLAGS,
     HesaiModel,
 )
-from mlbatch.simulate.interface import LidarFiles, PacketTopic, Sent
-from mlbatch.simulate.spinning import SpinningSpec
+from mlbatch.simulate.interface import LidarFiles, LidarModel, LidarSettings, PacketTopic, Sent
+from mlbatch.simulate.spinning import SpinningSpec, simulator
 from mlbatch.units import RAD_PER_DEG
 
 DATA_PORT = 2368
@@ -347,3 +347,28 @@ def _bytes_of(values: I64Array, kind: str) -> U8Array:
     """(..., bytes) of whole numbers (...)."""
     raw = np.ascontiguousarray(values.astype(kind))
     return raw.view(np.uint8).reshape(*values.shape, raw.itemsize)
+
+
+def _modes(name: str) -> tuple[str, ...]:
+    """Return the return modes; JT16 has one, and seven blocks cannot have pairs of returns."""
+    if name == "JT16":
+        return ("strongest",)
+    return ("strongest", "last") if MODELS[name].blocks % 2 else ("strongest", "last", "dual")
+
+
+LIDARS = tuple(
+    LidarModel(name, _modes(name), (10,) if name == "AT128" else (10, 5, 20)) for name in MODELS
+)
+
+
+def _unit(settings: LidarSettings) -> HesaiSpec:
+    return HesaiSpec(
+        settings.model,
+        settings.mode,
+        rpm=settings.rate_hz * 60,
+        start_deg=settings.phase_deg,
+        start_ns=settings.start_ns,
+    )
+
+
+simulated = simulator(_unit)

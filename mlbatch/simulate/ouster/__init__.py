@@ -1,1 +1,1 @@
-"""Ouster lidars: packets from measured distances; `lidar.py` is the simulator."""
+"""Ouster lidars."""

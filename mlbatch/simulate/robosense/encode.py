@@ -16,16 +16,17 @@ from typing import ClassVar
 import numpy as np
 
 from mlbatch.arrays import F64Array, I64Array, U8Array
-from mlbatch.simulate.interface import PacketTopic, Sent
+from mlbatch.simulate.interface import LidarModel, LidarSettings, PacketTopic, Sent
 from mlbatch.simulate.robosense.models import (
     AIRY_MOUNTS,
     DUAL,
+    EARLY,
     MODELS,
     STRONGEST,
     AngleLayout,
     RobosenseModel,
 )
-from mlbatch.simulate.spinning import SpinningSpec
+from mlbatch.simulate.spinning import SpinningSpec, simulator
 from mlbatch.units import NS_PER_S
 
 MSOP_PORT = 6699
@@ -363,3 +364,24 @@ def _angles(angles_deg: F64Array, layout: AngleLayout, *, signed: bool) -> bytes
     else:
         written = [abs(count).to_bytes(3, "big") for count in counts]
     return b"".join(written + [_UNWRITTEN] * (layout.slots - len(written)))
+
+
+LIDARS = tuple(
+    LidarModel(name, tuple(row.modes), (10, 5, 20))
+    for name, row in MODELS.items()
+    if not name.endswith(EARLY)
+)
+
+
+def _unit(settings: LidarSettings) -> RobosenseSpec:
+    return RobosenseSpec(
+        settings.model,
+        settings.mode,
+        rpm=settings.rate_hz * 60,
+        start_deg=settings.phase_deg,
+        start_ns=settings.start_ns,
+        serial=f"{settings.serial:012d}"[-12:],
+    )
+
+
+simulated = simulator(_unit)

@@ -15,8 +15,8 @@ from typing import ClassVar
 import numpy as np
 
 from mlbatch.arrays import F64Array, I64Array, U8Array
-from mlbatch.simulate.interface import LidarFiles, PacketTopic, Sent
-from mlbatch.simulate.spinning import SpinningSpec
+from mlbatch.simulate.interface import LidarFiles, LidarModel, LidarSettings, PacketTopic, Sent
+from mlbatch.simulate.spinning import SpinningSpec, simulator
 from mlbatch.simulate.velodyne.models import MODELS, Table, calibration_yaml
 from mlbatch.units import NS_PER_US
 
@@ -288,3 +288,21 @@ def _factory(spec: VelodyneSpec, product: int | None, count: int) -> U8Array:
         status = np.frombuffer(_STATUS, np.uint8)[np.arange(count) % len(_STATUS)]
         return np.stack((status, (np.arange(count) * 37 % 251).astype(np.uint8)), axis=1)
     return np.tile(np.array([_MODES[spec.mode], product], np.uint8), (count, 1))
+
+
+LIDARS = tuple(LidarModel(name, ("strongest", "last", "dual")) for name in MODELS)
+
+
+def _unit(settings: LidarSettings) -> VelodyneSpec:
+    hour, past_ns = divmod(settings.start_ns, HOUR_US * NS_PER_US)
+    return VelodyneSpec(
+        settings.model,
+        settings.mode,
+        rpm=settings.rate_hz * 60.0,
+        start_azimuth_deg=settings.phase_deg,
+        start_us=past_ns / NS_PER_US,
+        hour=hour,
+    )
+
+
+simulated = simulator(_unit)

@@ -10,7 +10,7 @@ import pytest
 
 from mlbatch.arrays import I64Array
 from mlbatch.sensors.hesai.angles import At128File
-from mlbatch.sensors.hesai.projections import at128_projection
+from mlbatch.sensors.hesai.sensor import at128_projection
 from tests.builders.decoded import Rotor, projected, rotor_words
 
 DEG = math.pi / 180
