@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from mlbatch.simulate.hesai.angles import angles_csv
+from mlbatch.simulate.hesai.encode import angles_csv
 from mlbatch.simulate.spinning import SpinningSpec
 from tests.builders import livox
 from tests.builders.bags import Recorded

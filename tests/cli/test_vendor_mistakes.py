@@ -7,8 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from mlbatch.simulate.hesai.angles import angles_csv, fan
-from mlbatch.simulate.hesai.encode import HesaiSpec
+from mlbatch.simulate.hesai.encode import HesaiSpec, angles_csv, fan
 from mlbatch.simulate.robosense.encode import RobosenseSpec
 from mlbatch.simulate.velodyne.encode import VelodyneSpec
 from mlbatch.simulate.velodyne.models import calibration_yaml

@@ -14,8 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from mlbatch.arrays import I64Array
-from mlbatch.simulate.hesai.angles import angles_csv
-from mlbatch.simulate.hesai.encode import HesaiSpec
+from mlbatch.simulate.hesai.encode import HesaiSpec, angles_csv
 from mlbatch.simulate.ouster.encode import OusterSpec, encode_packets, metadata_json
 from mlbatch.simulate.robosense.encode import RobosenseSpec
 from mlbatch.simulate.spinning import SpinningSpec

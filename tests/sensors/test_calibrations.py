@@ -16,8 +16,7 @@ from mlbatch import sensors
 from mlbatch.errors import RigError, UsageError
 from mlbatch.lidar.geometry import read_rotor_words
 from mlbatch.lidar.interface import NAMED_ONLY, Calibration, Evidence
-from mlbatch.simulate.hesai.angles import angles_csv
-from mlbatch.simulate.hesai.encode import HesaiSpec
+from mlbatch.simulate.hesai.encode import HesaiSpec, angles_csv
 from mlbatch.simulate.ouster.encode import OusterSpec
 from mlbatch.simulate.robosense.encode import RobosenseSpec
 from mlbatch.simulate.robosense.encode import angles_csv as robosense_csv

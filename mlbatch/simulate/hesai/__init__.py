@@ -1,1 +1,1 @@
-"""HESAI lidars: packets from measured distances; `lidar.py` is the simulator."""
+"""HESAI lidars: packets from measured distances."""

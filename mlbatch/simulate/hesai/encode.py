@@ -1,24 +1,25 @@
 """Encoder of HESAI packets and angle files: what a lidar would send, from plain values.
 
-Source: docs/sources/hesai.md sections 2 (layout), 3 (tails), 4 (dates), 5 (times), 7 (checksums), 8
-(JT16); rows of the models: `models.py`, angles: `angles.py`. Column k is the k-th group of blocks
-that share an azimuth; the rotor has constant speed.
+Source: docs/sources/hesai.md sections 2 (layout), 3 (tails), 4 (dates), 5 (times), 6 (angles and
+the files with them), 7 (checksums), 8 (JT16); rows of the models: `models.py`. Column k is the k-th
+group of blocks that share an azimuth; the rotor has constant speed.
 """
 
 from __future__ import annotations
 
 import functools
+import hashlib
 import struct
 import zlib
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime, timedelta
-from typing import ClassVar
+from typing import ClassVar, Protocol
 
 import numpy as np
 
 from mlbatch.arrays import BoolArray, F64Array, I64Array, U8Array
 from mlbatch.sensors.hesai.firing import NEVER
-from mlbatch.simulate.hesai.angles import Angles, Beams, MirrorAngles, angles_csv, fan
 from mlbatch.simulate.hesai.models import (
     EPOCH,
     HIGH,
@@ -52,6 +53,83 @@ _MIRROR_STARTS_DEG = (20.0, 140.0, 260.0)
 _HALF_VIEW_DEG = 60.0
 _SIGNATURE = bytes(range(32))
 _REVERSED_BITS = bytes(int(f"{byte:08b}"[::-1], 2) for byte in range(256))
+
+
+class Beams(Protocol):
+    """Where the beams of a lidar look."""
+
+    def aim(self, rotor_deg: F64Array) -> tuple[F64Array, F64Array]:
+        """Azimuth and elevation (n, channels), deg, at rotor angles (n, channels)."""
+        ...
+
+
+@dataclass(frozen=True)
+class Angles:
+    """Beams of a turning lidar, deg, (channels,)."""
+
+    elevation_deg: Sequence[float]
+    azimuth_deg: Sequence[float]
+
+    def aim(self, rotor_deg: F64Array) -> tuple[F64Array, F64Array]:
+        """The rotor's angle is added to the azimuths."""
+        elevation = np.asarray(self.elevation_deg, np.float64)
+        return rotor_deg + np.asarray(self.azimuth_deg), np.broadcast_to(elevation, rotor_deg.shape)
+
+
+@dataclass(frozen=True)
+class MirrorAngles:
+    """Beams of an AT128, deg: starts of the three fields, which have no gaps; (128,) angles."""
+
+    start_deg: tuple[float, float, float]
+    elevation_deg: Sequence[float]
+    azimuth_deg: Sequence[float]
+
+    def aim(self, rotor_deg: F64Array) -> tuple[F64Array, F64Array]:
+        """Twice the angle since the start of the mirror; no adjustments."""
+        past = np.stack([(rotor_deg - start) % 360 for start in self.start_deg]).min(axis=0)
+        elevation = np.asarray(self.elevation_deg, np.float64)
+        return 2 * past - np.asarray(self.azimuth_deg), np.broadcast_to(elevation, past.shape)
+
+    def dat(self) -> bytes:
+        """The correction file of the unit, in steps of 1/25600 deg."""
+        starts = [round(deg * 25600) for deg in self.start_deg]
+        body = bytes.fromhex("eeff0105800303") + bytes(8) + bytes([1])
+        body += struct.pack("<6I", *starts, *starts[1:], starts[0])
+        for angles in (self.azimuth_deg, self.elevation_deg):
+            body += struct.pack("<128i", *(round(deg * 25600) for deg in angles))
+        body += bytes(2 * 128 * 180)
+        return body + hashlib.sha256(body).digest()
+
+
+# Highest and lowest beam by the data sheets, deg; of other models as of a PandarXT-16.
+_SPAN_DEG = (14.9, -15.1)
+_WIDE_DEG = (14.9, -24.9)
+_SPANS_DEG = {
+    "Pandar20A": (7.9, -24.9),
+    "Pandar20B": (2.9, -18.9),
+    "Pandar40P": _WIDE_DEG,
+    "Pandar40M": _WIDE_DEG,
+    "Pandar64": _WIDE_DEG,
+    "Pandar64-7": _WIDE_DEG,
+    "PandarQT64": (52.1, -52.1),
+    "QT128C2X": (52.6, -52.6),
+    "XT32M2X": (19.5, -20.8),
+    "Pandar128E3X": _WIDE_DEG,
+    "OT128": _WIDE_DEG,
+}
+
+
+def fan(model: str, channels: int) -> tuple[list[float], list[float]]:
+    """Elevations and azimuths of a made-up unit, deg: evenly spread."""
+    elevation = np.linspace(*_SPANS_DEG.get(model, _SPAN_DEG), channels)
+    return elevation.round(3).tolist(), np.linspace(-4.0, 4.0, channels).round(3).tolist()
+
+
+def angles_csv(elevation_deg: Sequence[float], azimuth_deg: Sequence[float]) -> bytes:
+    """The angle file of a unit."""
+    rows = enumerate(zip(elevation_deg, azimuth_deg, strict=True), 1)
+    lines = [f"{channel},{elevation},{azimuth}\n" for channel, (elevation, azimuth) in rows]
+    return "".join(["Laser id,Elevation,Azimuth\n", *lines]).encode()
 
 
 @dataclass(frozen=True)

@@ -1,1 +1,1 @@
-"""Ouster lidars."""
+"""Ouster lidars: packets from measured distances."""

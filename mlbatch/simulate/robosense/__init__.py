@@ -1,1 +1,1 @@
-"""ROBOSENSE lidars: packets from measured distances; `lidar.py` is the simulator."""
+"""ROBOSENSE lidars: packets from measured distances."""

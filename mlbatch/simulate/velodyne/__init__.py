@@ -1,1 +1,1 @@
-"""Velodyne lidars: packets from measured distances; `lidar.py` is the simulator."""
+"""Velodyne lidars: packets from measured distances."""

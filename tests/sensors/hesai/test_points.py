@@ -19,7 +19,7 @@ import pytest
 
 from mlbatch.arrays import F32Array, I64Array
 from mlbatch.lidar.interface import Lidar
-from mlbatch.simulate.hesai.angles import angles_csv, fan
+from mlbatch.simulate.hesai.encode import angles_csv, fan
 from tests.builders.decoded import readings
 from tests.builders.others import rows
 from tests.builders.spinning import evidence_of, fired, from_file

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from mlbatch.arrays import F64Array
-from mlbatch.simulate.hesai.angles import angles_csv
-from mlbatch.simulate.hesai.encode import HesaiSpec
+from mlbatch.simulate.hesai.encode import HesaiSpec, angles_csv
 from tests.builders.decoded import Rotor, projected, readings
 from tests.builders.others import filled, rows
 from tests.builders.spinning import evidence_of, from_file, stream_of
