@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import importlib
 import pkgutil
+from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache
@@ -107,35 +108,35 @@ class LidarFiles:
     topic: str = ""
 
 
-class SimulatedLidar(Protocol):
+class SimulatedLidar(ABC):
     """A lidar that sends packets; its rotor has constant speed by its own clock."""
 
     # Name of the model as in a rig, "" if packets identify it.
-    rig_model: str
+    rig_model: str = ""
     # Destination ports, and their topics; ports without a topic are left out of bags.
     topics: Mapping[int, PacketTopic]
-    files: LidarFiles
+    files: LidarFiles = LidarFiles()
     # Seconds by the sensor clock from chunk to chunk.
     chunk_s: float
-    imu: ImuUnit | None
+    imu: ImuUnit | None = None
 
+    @abstractmethod
     def shots(self, chunk: int) -> Shots:
         """Rays of the columns of a chunk."""
-        ...
 
+    @abstractmethod
     def packets(self, chunk: int, distance_m: F64Array, reflectivity: F64Array) -> list[Sent]:
         """Packets of a chunk, and others of the same time, in any order.
 
         distance_m: (n, c) from the origins of the rays, inf for no return; reflectivity: (n, c), 0
         to 255.
         """
-        ...
 
     def imu_packets(
         self, time_ns: I64Array, acceleration: F64Array, angular_velocity: F64Array
     ) -> list[Sent]:
         """Packets of IMU samples: (n,) sensor clock, (n, 3) m/s2 and rad/s, frame of the IMU."""
-        ...
+        return []
 
 
 class Simulator(Protocol):

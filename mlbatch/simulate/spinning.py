@@ -10,7 +10,6 @@ import numpy as np
 
 from mlbatch.arrays import BoolArray, F64Array, I64Array
 from mlbatch.simulate.interface import (
-    ImuUnit,
     LidarFiles,
     LidarSettings,
     PacketTopic,
@@ -144,10 +143,8 @@ class SpinningSpec(ABC):
         """Time of the start, by the sensor's clock."""
 
 
-class SimulatedSpinner:
-    """Columns of a spinning lidar follow each other without a gap; implements `SimulatedLidar`."""
-
-    imu: ImuUnit | None = None
+class SimulatedSpinner(SimulatedLidar):
+    """Columns of a spinning lidar follow each other without a gap."""
 
     def __init__(self, spec: SpinningSpec) -> None:
         self._spec = spec
@@ -192,12 +189,6 @@ class SimulatedSpinner:
             )
             for after_ns in range(-(-begin_ns // period_ns) * period_ns, end_ns, period_ns)
         ]
-
-    def imu_packets(
-        self, time_ns: I64Array, acceleration: F64Array, angular_velocity: F64Array
-    ) -> list[Sent]:
-        """None: IMUs of spinning lidars of these vendors are not simulated."""
-        return []
 
 
 def simulator(unit: Callable[[LidarSettings], SpinningSpec]) -> Callable[..., SimulatedLidar]:

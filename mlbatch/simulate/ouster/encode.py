@@ -47,6 +47,7 @@ from mlbatch.simulate.interface import (
     PacketTopic,
     Sent,
     Shots,
+    SimulatedLidar,
     whole_counts,
 )
 from mlbatch.units import M_PER_MM, MM_PER_M, NS_PER_S, RAD_PER_DEG, STANDARD_GRAVITY
@@ -330,7 +331,7 @@ def simulated(settings: LidarSettings) -> SimulatedOuster:
     return SimulatedOuster(settings)
 
 
-class SimulatedOuster:
+class SimulatedOuster(SimulatedLidar):
     """Columns of a revolution are evenly timed; all beams of a column fire at once."""
 
     def __init__(self, settings: LidarSettings) -> None:
@@ -354,7 +355,6 @@ class SimulatedOuster:
             beam_offset_mm=(line.origin_mm, 0.0),
             lidar_to_sensor_mm=[-1, 0, 0, 0, 0, -1, 0, 0, 0, 0, 1, line.lift_mm, 0, 0, 0, 1],
         )
-        self.rig_model = ""
         self.topics = {
             self._spec.lidar_port: PacketTopic("lidar_packets", "ouster_sensor_msgs/PacketMsg"),
             self._spec.imu_port: PacketTopic("imu_packets", "ouster_sensor_msgs/PacketMsg"),
