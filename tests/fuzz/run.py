@@ -14,9 +14,19 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from tests.fuzz.harness import LONGEST_S, Failure, Tally, campaign
-from tests.fuzz.targets import TARGETS
+from tests.fuzz import compiled, messages, outputs, packets, readers, sessions, texts
+from tests.fuzz.harness import LONGEST_S, Failure, Tally, Target, campaign
 
+# In the order in which they run.
+TARGETS: Sequence[Target] = (
+    *readers.TARGETS,
+    *messages.TARGETS,
+    *packets.TARGETS,
+    *texts.TARGETS,
+    *outputs.TARGETS,
+    *sessions.TARGETS,
+    *compiled.TARGETS,
+)
 FOLDER = Path("build") / "fuzz"
 _PART = 2000
 _REPORT_EVERY = 50_000

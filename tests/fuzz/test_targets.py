@@ -22,7 +22,7 @@ from tests.fuzz.harness import (
     make_input,
 )
 from tests.fuzz.mutation import Seeds
-from tests.fuzz.targets import TARGETS
+from tests.fuzz.run import TARGETS
 
 # Inputs of a target by its share; the seeds themselves come first.
 _PER_SHARE = 12
