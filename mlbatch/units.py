@@ -25,25 +25,28 @@ _MAX_CHARACTERS = 100
 _MAX_DECIMALS = 9
 
 
-def parse_rate(text: str) -> Fraction:
-    """Return the exact rate in Hz of text as `10`, `29.97`, `10/3` or `1e1`; UsageError if none."""
+def parse_rate(text: str, option: str = "rate") -> Fraction:
+    """Return the exact rate in Hz of text as `10`, `29.97`, `10/3` or `1e1`; UsageError if none.
+
+    option: its name in errors.
+    """
     cleaned = text.strip()
     shown = cleaned if len(cleaned) <= 40 else cleaned[:40] + "..."
     if len(cleaned) > _MAX_CHARACTERS or re.fullmatch(_NUMBER, cleaned, re.ASCII) is None:
         raise UsageError(
-            f"rate: expected a positive number of Hz (10, 29.97 or 10/3), found {shown!r}; "
+            f"{option}: expected a positive number of Hz (10, 29.97 or 10/3), found {shown!r}; "
             "write a decimal number or a fraction"
         )
     try:
         rate = Fraction(cleaned)
     except ZeroDivisionError:
         raise UsageError(
-            f"rate: expected a fraction with a denominator above 0, found {shown!r}; "
+            f"{option}: expected a fraction with a denominator above 0, found {shown!r}; "
             "write it as 10/3"
         ) from None
     if not MIN_RATE_HZ <= rate <= MAX_RATE_HZ:
         raise UsageError(
-            f"rate: expected {rate_text(MIN_RATE_HZ)} to {rate_text(MAX_RATE_HZ)} Hz, "
+            f"{option}: expected {rate_text(MIN_RATE_HZ)} to {rate_text(MAX_RATE_HZ)} Hz, "
             f"found {shown!r}; lidars run at 5 to 20 Hz"
         )
     return rate

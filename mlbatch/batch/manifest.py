@@ -25,6 +25,7 @@ from mlbatch.batch.session import (
     read_rig,
 )
 from mlbatch.errors import RecordingError, UsageError
+from mlbatch.pipeline.job import Shard
 from mlbatch.readers.datasets import BAG_METADATA
 from mlbatch.rig.recipes import rig_of
 from mlbatch.rig.yaml_tree import Node, read_yaml
@@ -405,20 +406,7 @@ def _joined(*several: Mapping[str, Option | None]) -> tuple[Option, ...]:
 # -- a part of them ---------------------------------------------------------------------------
 
 
-def parse_part(text: str) -> tuple[int, int]:
-    """`--part K/N`: K from 1 to N."""
-    match = re.fullmatch(r"(\d{1,6})/(\d{1,6})", text)
-    number, count = (int(match[1]), int(match[2])) if match else (0, 0)
-    if not 1 <= number <= count:
-        raise UsageError(
-            f"--part: expected K/N with K from 1 to N, found {text!r}; write --part 1/16"
-        )
-    return number, count
-
-
-def chosen(
-    sessions: Sequence[Session], only: Sequence[str], part: tuple[int, int]
-) -> tuple[Session, ...]:
+def chosen(sessions: Sequence[Session], only: Sequence[str], part: Shard) -> tuple[Session, ...]:
     """The sessions of `--only` and `--part`: of N parts, each Nth session by name."""
     names = {session.name for session in sessions}
     for name in only:
@@ -429,6 +417,5 @@ def chosen(
             raise UsageError(
                 f"--only: expected the name of a session, found {name!r}; the nearest is {nearest}"
             )
-    number, count = part
-    mine = sorted(names)[number - 1 :: count]
+    mine = [name for number, name in enumerate(sorted(names)) if part.has(number)]
     return tuple(one for one in sessions if one.name in mine and (not only or one.name in only))

@@ -98,7 +98,7 @@ def batch(
 ) -> None:
     """Convert many sessions, a process each; a second run does what is missing or changed."""
     from mlbatch.batch.driver import BATCH_LOG, Batch
-    from mlbatch.batch.manifest import Common, chosen, parse_part, sessions_of
+    from mlbatch.batch.manifest import Common, chosen, sessions_of
     from mlbatch.batch.plan import plan_of
     from mlbatch.batch.record import KNOWN_BAD
     from mlbatch.batch.remote import default_cache
@@ -107,13 +107,14 @@ def batch(
     from mlbatch.cli import EXIT_LIMIT
     from mlbatch.cli.summary import say
     from mlbatch.pipeline.interrupts import interruptible
+    from mlbatch.pipeline.job import parse_shard
     from mlbatch.rig.rig import read_rig
 
     _check_counts(workers=workers, retries=retries)
     if cache_gb is not None:
         say("--cache-gb is ignored, since copies are removed when their session has ended")
     jobs = _jobs(jobs, workers)
-    numbers = parse_part(part)
+    numbers = parse_shard("--part", part)
     limits = read_limits(time_limit, disk_limit, ("--time-limit", "--disk-limit"))
     if dataset is not None:
         from mlbatch.rig.recipes import rig_of

@@ -96,9 +96,7 @@ def _source(
     from mlbatch.cli.values import job_of
     from mlbatch.python.recording import scans_of
 
-    defaults = {option.name: option.default for option in options.CONVERT}
-    given = {"pass_": None, "no_pose_check": True} | values
-    job = job_of(paths, defaults | given)
+    job = job_of(paths, {"no_pose_check": True} | values)
     said: set[Note] = set()
 
     def warn(note: Note) -> None:

@@ -6,14 +6,13 @@ import math
 import re
 from dataclasses import dataclass, field
 from fractions import Fraction
-from operator import index
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple, SupportsIndex
+from typing import TYPE_CHECKING, NamedTuple
 
 from mlbatch.batching.windows import COMMON, WINDOW, Limit
 from mlbatch.discovery.discover import SensorSelection
 from mlbatch.errors import UsageError
-from mlbatch.options import BATCHING_TIMES, BATCHINGS, INSTANTS, SORTS
+from mlbatch.options import INSTANTS
 from mlbatch.types import EXTRAS, RecordLayout
 from mlbatch.units import NS_PER_S
 
@@ -24,7 +23,6 @@ DEFAULT_RATE = Fraction(10)
 DEFAULT_MAX_WAIT_NS = NS_PER_S
 # Upper bound of any time, s: its nanoseconds fit into int64.
 MOST_S = 2**33
-MAX_SLICES = 10_000
 
 
 class TimeSegment(NamedTuple):
@@ -49,13 +47,13 @@ class Shard:
         return file % self.count == self.number - 1
 
 
-def parse_shard(text: str) -> Shard:
-    """`--shard K/N`: K from 1 to N."""
+def parse_shard(option: str, text: str) -> Shard:
+    """A part of a whole, K/N with K from 1 to N; option: for errors."""
     match = re.fullmatch(r"(\d{1,6})/(\d{1,6})", text, re.ASCII)
     shard = Shard(int(match[1]), int(match[2])) if match else Shard(0, 0)
     if not 1 <= shard.number <= shard.count:
         raise UsageError(
-            f"--shard: expected K/N with K from 1 to N, found {text!r}; write --shard 1/8"
+            f"{option}: expected K/N with K from 1 to N, found {text!r}; write {option} 1/8"
         )
     return shard
 
@@ -120,38 +118,20 @@ class Job:
         return tuple((name, value) for name, value, default in values if value != default)
 
 
-def wait_ns(option: str, seconds: float, given: object) -> int | None:
-    """`max_wait_ns` of a job from seconds; given: as the user wrote it, for errors."""
+def wait_ns(option: str, given: object) -> int | None:
+    """`max_wait_ns` of a job: from seconds, as a number or a text, or inf; None: infinite."""
+    try:
+        seconds = float(given)  # type: ignore[arg-type]
+    except (TypeError, ValueError):
+        seconds = math.nan
     if math.isnan(seconds) or seconds <= 0:
         raise UsageError(f"{option}: expected seconds above 0, or inf, found {given!r}; write 1.0")
     # Rounds less than a nanosecond up, since it is above 0.
     return None if seconds > MOST_S else max(1, round(seconds * NS_PER_S))
 
 
-def check_max_bag_s(option: str, seconds: float) -> float:
-    """`max_bag_s` of a job: 0 if not given, else above 0."""
-    if not 0 <= seconds <= MOST_S:
-        raise UsageError(
-            f"{option}: expected seconds above 0 and at most {MOST_S}, found {seconds}; write 60, "
-            "or leave it out for one file"
-        )
-    return seconds
-
-
-def check_slices(option: str, count: object) -> int:
-    """`slices` of a job, a whole number."""
-    if not (isinstance(count, SupportsIndex) and 1 <= index(count) <= MAX_SLICES):
-        raise UsageError(
-            f"{option}: expected a whole number from 1 to {MAX_SLICES}, found {count!r}; leave it "
-            "out for 1"
-        )
-    return index(count)
-
-
 def check_sort(option: str, sort: str, layout: str) -> str:
     """`sort` of a job; an organized scan has no order of points."""
-    if sort not in SORTS:
-        raise UsageError(f"{option}: expected {' or '.join(SORTS)}, found {sort!r}; choose one")
     if sort == "points" and layout == "organized":
         raise UsageError(
             f"{option} points: expected a dense layout, found organized, whose points have the "
@@ -200,14 +180,6 @@ def _check_velocity(job: Job) -> None:
 
 def check_batching(job: Job) -> Job:
     """Return the job; UsageError for options that have no meaning for sets of sweeps."""
-    for option, word, words in (
-        ("--batching", job.batching, BATCHINGS),
-        ("--batching-times", job.batching_times, BATCHING_TIMES),
-    ):
-        if word not in words:
-            raise UsageError(
-                f"{option}: expected {', '.join(words)}, found {word!r}; choose one of them"
-            )
     if not job.is_fused:
         if job.batching_times != COMMON:
             raise UsageError(
@@ -232,8 +204,6 @@ def check_batching(job: Job) -> Job:
 
 def check_ranges_m(low_option: str, low: float, high_option: str, high: float) -> None:
     """Raise UsageError for ranges that leave no point."""
-    if not 0 <= low < math.inf:
-        raise UsageError(f"{low_option}: expected 0 or more metres, found {low}; write 0.5")
     if not high > low:
         raise UsageError(
             f"{high_option}: expected more than {low_option} ({low} m), found {high} m; write 100"

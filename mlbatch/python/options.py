@@ -13,7 +13,7 @@ import warnings
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
 from fractions import Fraction
-from numbers import Real
+from numbers import Integral, Real
 from os import PathLike, fspath
 from pathlib import Path
 from typing import Any, Literal, TypeAlias, TypedDict, TypeVar
@@ -22,19 +22,21 @@ import numpy as np
 
 from mlbatch.discovery.discover import SensorSelection
 from mlbatch.errors import UsageError
-from mlbatch.options import ALIGN_TO, CLOCKS, INSTANTS, LAYOUTS
+from mlbatch.options import CONVERT, INSTANTS, NUMBER, WHOLE, Option
 from mlbatch.pipeline.job import (
     Job,
     check_batching,
     check_deskew,
     check_ranges_m,
-    check_slices,
     check_sort,
     wait_ns,
 )
+from mlbatch.pipeline.output import OutputRequest
 from mlbatch.readers.inputs import expand
 from mlbatch.rig.convert_keys import POSE_MODELS
+from mlbatch.sensors.options import check_options
 from mlbatch.units import parse_rate
+from mlbatch.writers import parse_jobs
 
 AnyPath: TypeAlias = "str | PathLike[str]"
 # One path or several: a text is one, never an iterable of its letters.
@@ -86,8 +88,10 @@ def rig_path(value: Document | None) -> Path | None:
     )
 
 
-def metadata_paths(values: Documents) -> tuple[Path, ...]:
+def metadata_paths(values: Documents | None) -> tuple[Path, ...]:
     """Files of metadata; those given as mappings, alone or by name, are written first."""
+    if values is None:
+        return ()
     if isinstance(values, Mapping):
         return tuple(_written("metadata", f"{name}.json", one) for name, one in values.items())
     if isinstance(values, str | PathLike) or not isinstance(values, Iterable):
@@ -131,9 +135,9 @@ def _with_paths(value: object, key: str = "") -> object:
     return value
 
 
-def names_of(values: Names) -> tuple[str, ...]:
+def names_of(values: Names | None) -> tuple[str, ...]:
     """One or several names as a tuple."""
-    return (values,) if isinstance(values, str) else tuple(values)
+    return (values,) if isinstance(values, str) else tuple(values or ())
 
 
 def _path(what: str, value: object) -> Path:
@@ -162,9 +166,9 @@ class SessionOptions(TypedDict, total=False):
 
     rig: Document | None
     dataset: str | None  # a recipe of `mlbatch datasets`
-    metadata: Documents
-    only: Names
-    ignore: Names
+    metadata: Documents | None
+    only: Names | None
+    ignore: Names | None
     identity_extrinsics: bool
     clock: str
     align_clocks: bool
@@ -209,7 +213,7 @@ class ScanOptions(SessionOptions, RatedOptions, total=False):
 class OutputOptions(TypedDict, total=False):
     """Options of an output."""
 
-    copy_topics: Names
+    copy_topics: Names | None
     stamp: str
     format: str | None
     point_layout: str
@@ -270,6 +274,34 @@ def _as_in_python(name: str) -> str:
     return name
 
 
+def complete(options: Mapping[str, Any], shown: Callable[[str], str]) -> dict[str, Any]:
+    """All options of the table with the values given, else their defaults.
+
+    shown: the name of an option in errors. Raises UsageError for words that an option does not
+    have, and for numbers beyond its bounds.
+    """
+    values: dict[str, Any] = {option.name: option.default for option in CONVERT}
+    values |= options
+    for option in CONVERT:
+        value = values[option.name]
+        if value is None and option.default is None:
+            continue
+        if option.words and not option.is_open:
+            choice(shown(option.name), value, option.words)
+        elif option.kind in (NUMBER, WHOLE):
+            _check_number(option, value, shown(option.name))
+    return values
+
+
+def _check_number(option: Option, value: Any, shown: str) -> None:
+    kind = Integral if option.kind == WHOLE else Real
+    high = math.inf if option.high is None else option.high
+    is_number = isinstance(value, kind) and not isinstance(value, bool)
+    if not (is_number and (option.low or 0) <= value <= high):
+        remedy = "correct it" if option.default is None else f"leave it out for {option.default:g}"
+        raise UsageError(f"{shown}: expected {option.bounds}, found {value!r}; {remedy}")
+
+
 def session_job(
     recordings: Paths | tuple[Paths, ...],
     options: SessionOptions,
@@ -279,103 +311,120 @@ def session_job(
 
     shown: the name of an option in errors.
     """
-    clock = choice(shown("clock"), options.get("clock", "sensor"), CLOCKS)
-    align_to = choice(shown("align_to"), options.get("align_to", "host"), ALIGN_TO)
-    aligned = options.get("align_clocks", False)
-    rig = rig_path(options.get("rig"))
-    if options.get("dataset") is not None:
+    values = complete(options, shown)
+    rig = rig_path(values["rig"])
+    if values["dataset"] is not None:
         # Few runs have it.
         from mlbatch.rig.recipes import rig_of
 
-        rig = rig_of(rig, options["dataset"], shown("dataset"))
+        rig = rig_of(rig, values["dataset"], shown("dataset"))
+    aligned = values["align_clocks"]
     return Job(
         recordings=recordings_of(recordings),
         selection=SensorSelection(
             rig=rig,
-            metadata=metadata_paths(options.get("metadata", ())),
-            only=names_of(options.get("only", ())),
-            ignore=names_of(options.get("ignore", ())),
-            identity_extrinsics=options.get("identity_extrinsics", False),
-            host_clock=clock == "host",
+            metadata=metadata_paths(values["metadata"]),
+            only=names_of(values["only"]),
+            ignore=names_of(values["ignore"]),
+            identity_extrinsics=values["identity_extrinsics"],
+            host_clock=values["clock"] == "host",
             aligned=aligned,
-            decode=dict(options.get("decode") or {}),
+            decode=_decode(values["decode"] or ()),
         ),
-        align_clocks_to=align_to if aligned else "",
-        strict=options.get("strict", False),
+        align_clocks_to=values["align_to"] if aligned else "",
+        strict=values["strict"],
     )
 
 
 def window_job(job: Job, options: RatedOptions, shown: Callable[[str], str] = _as_in_python) -> Job:
     """A job with the options of windows and points; shown: the name of an option in errors."""
-    layout = choice(shown("layout"), options.get("layout", "dense"), LAYOUTS)
-    rate = options.get("rate")
-    deskew_to = options.get("deskew_to")
-    low = _number(shown("min_range"), options.get("min_range", 0.0))
-    high = _number(shown("max_range"), options.get("max_range", math.inf))
+    values = complete(options, shown)
+    rate, deskew_to = values["rate"], values["deskew_to"]
+    low, high = float(values["min_range"]), float(values["max_range"])
     check_ranges_m(shown("min_range"), low, shown("max_range"), high)
-    drop_incomplete = _number(shown("drop_incomplete"), options.get("drop_incomplete", 0.0))
-    if not 0 <= drop_incomplete <= 100:
-        raise UsageError(
-            f"{shown('drop_incomplete')}: expected a share from 0 to 100 %, found "
-            f"{drop_incomplete:g}; correct it"
-        )
-    first, last = options.get("start"), options.get("end")
+    first, last = values["start"], values["end"]
     start, end, are_dates = None, None, False
     if first is not None or last is not None:
         # Not loaded for whole recordings.
         from mlbatch.pipeline.time_limits import limits_of
 
         start, end, are_dates = limits_of(shown("start"), first, shown("end"), last)
+    # Python has a list of boxes; the command line repeats one.
+    boxes = "exclude_boxes" if "exclude_boxes" in values else "exclude_box"
     job = replace(
         job,
         # By the text of a float: 29.97 means 2997/100, not the nearest binary number.
-        rate=None if rate is None else parse_rate(str(rate)),
-        slices=check_slices(shown("slices"), options.get("slices", 1)),
-        layout=layout,
-        sort=check_sort(shown("sort"), options.get("sort", "columns"), layout),
-        split=options.get("split", False),
-        keep_partial=options.get("keep_partial", False),
-        keep_repeated=options.get("keep_repeated", False),
-        drop_incomplete=drop_incomplete,
-        max_wait_ns=read_wait_ns(shown("max_wait"), options.get("max_wait", 1.0)),
+        rate=None if rate is None else parse_rate(str(rate), shown("rate")),
+        slices=int(values["slices"]),
+        layout=values["layout"],
+        sort=check_sort(shown("sort"), values["sort"], values["layout"]),
+        split=values["split"],
+        keep_partial=values["keep_partial"],
+        keep_repeated=values["keep_repeated"],
+        drop_incomplete=float(values["drop_incomplete"]),
+        max_wait_ns=wait_ns(shown("max_wait"), values["max_wait"]),
         start=start,
         end=end,
         limits_are_dates=are_dates,
         min_range_m=low,
         max_range_m=high,
-        boxes_m=tuple(_box(box) for box in options.get("exclude_boxes", ())),
-        batching=options.get("batching", "window"),
-        batching_times=options.get("batching_times", "common"),
-        deskew=str(path_of("deskew", options.get("deskew")) or ""),
-        checks_poses=not options.get("no_pose_check", False),
-        deskew_to=choice(shown("deskew_to"), deskew_to or INSTANTS[0], INSTANTS),
+        boxes_m=tuple(box_m(shown(boxes), box) for box in values[boxes] or ()),
+        batching=values["batching"],
+        batching_times=values["batching_times"],
+        deskew=str(path_of("deskew", values["deskew"] or None) or ""),
+        checks_poses=not values["no_pose_check"],
+        deskew_to=deskew_to or INSTANTS[0],
     )
     return check_deskew(check_batching(job), deskew_to is not None)
 
 
-def read_wait_ns(option: str, given: float | str) -> int | None:
-    """`--max-wait`: seconds, or inf; None: infinite."""
+def output_job(
+    job: Job, options: OutputOptions, shown: Callable[[str], str] = _as_in_python
+) -> Job:
+    """A job with the options of messages and files; shown: the name of an option in errors."""
+    values = complete(options, shown)
+    return replace(
+        job,
+        passed=names_of(values.get("copy_topics", values["pass"])),
+        stamp=values["stamp"],
+        max_bag_s=float(values["max_bag_duration"]),
+    )
+
+
+def output_request(
+    path: Path | None, options: OutputOptions, shown: Callable[[str], str] = _as_in_python
+) -> OutputRequest:
+    """Where a result goes, and how it is stored; shown: the name of an option in errors."""
+    values = complete(options, shown)
+    same = ("format", "point_layout", "compression", "ply_style", "voxel", "crs", "overwrite")
+    return OutputRequest(
+        path,
+        **{name: values[name] for name in (*same, "dry_run", "resume")},
+        jobs=parse_jobs(shown("jobs"), str(values["jobs"])),
+        report=path_of("report", values["report"]),
+        accumulate=path_of("accumulate", values["accumulate"]),
+        fsync=values.get("fsync", not values["no_fsync"]),
+    )
+
+
+def _decode(given: Mapping[str, str] | Iterable[str]) -> dict[str, str]:
+    """Options of decoders: by their names, or as texts KEY=VALUE."""
+    if not isinstance(given, Mapping):
+        given = dict(text.partition("=")[::2] for text in given)
+    check_options(given)
+    return dict(given)
+
+
+def box_m(option: str, values: Box | str) -> tuple[float, ...]:
+    """An excluded box, m: numbers, or a text with commas between them; option: for errors."""
+    numbers = values.split(",") if isinstance(values, str) else values
     try:
-        seconds = float(given)
-    except (TypeError, ValueError):
-        seconds = math.nan
-    return wait_ns(option, seconds, given)
-
-
-def _number(option: str, value: object) -> float:
-    if isinstance(value, bool) or not isinstance(value, Real):
-        raise UsageError(f"{option}: expected a number, found {value!r}; correct it")
-    return float(value)
-
-
-def _box(values: Box) -> tuple[float, ...]:
-    try:
-        box = tuple(map(float, values)) if isinstance(values, Iterable) else ()
+        box = tuple(map(float, numbers)) if isinstance(numbers, Iterable) else ()
     except (TypeError, ValueError):
         box = ()
     if len(box) != _BOX_VALUES or not all(a < b for a, b in zip(box[:3], box[3:], strict=True)):
         raise UsageError(
-            "exclude_boxes: expected (x0, y0, z0, x1, y1, z1) in metres with x0 < x1, y0 < y1, "
-            f"z0 < z1, found {values!r}; correct it"
+            f"{option}: expected x0,y0,z0,x1,y1,z1 in metres with x0 < x1, y0 < y1, z0 < z1, "
+            f"found {values!r}; write -1,-1,0,1,1,2"
         )
     return box

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
-from mlbatch.options import INSTANTS
 from mlbatch.outputs.scan import preformatted
-from mlbatch.pipeline.job import Job, check_max_bag_s
-from mlbatch.pipeline.output import Output, OutputRequest
-from mlbatch.python.options import OutputOptions, choice, names_of, path_of
+from mlbatch.pipeline.job import Job
+from mlbatch.pipeline.output import Output
+from mlbatch.python.options import OutputOptions, output_job, output_request
 from mlbatch.reports.ledger import SensorLedger
 from mlbatch.reports.report import (
     RunReport,
@@ -21,7 +20,6 @@ from mlbatch.reports.report import (
     summary_lines,
 )
 from mlbatch.reports.scan_table import ScanStatistics
-from mlbatch.writers import parse_jobs
 
 # Of the caller of `mlbatch.convert`, as calls above that of `warnings.warn`.
 _USER = 6
@@ -112,34 +110,12 @@ class Run:
 
 def run_job(job: Job, path: Path | None, options: OutputOptions) -> Run:
     """Convert to `path` (None: a dry run); the report is written as by the command."""
-    jobs = parse_jobs("jobs", str(options.get("jobs", "auto")))
-    report = path_of("report", options.get("report"))
-    accumulate = path_of("accumulate", options.get("accumulate"))
-    job = replace(
-        job,
-        passed=names_of(options.get("copy_topics", ())),
-        stamp=choice("stamp", options.get("stamp", INSTANTS[0]), INSTANTS),
-        max_bag_s=check_max_bag_s("max_bag_duration", options.get("max_bag_duration", 0.0)),
-    )
-    request = OutputRequest(
-        path,
-        options.get("format"),
-        options.get("point_layout", "standard"),
-        options.get("compression", "none"),
-        options.get("ply_style", "standard"),
-        dry_run=path is None and accumulate is None,
-        jobs=jobs,
-        report=report,
-        accumulate=accumulate,
-        voxel=options.get("voxel"),
-        crs=options.get("crs"),
-        overwrite=options.get("overwrite", False),
-        fsync=options.get("fsync", True),
-    )
+    request = output_request(path, options)
+    request = request._replace(dry_run=path is None and request.accumulate is None)
 
     def warn(text: str) -> None:
         warnings.warn(text, stacklevel=_USER)
 
-    output = Output(job, request, warn, warn)
+    output = Output(output_job(job, options), request, warn, warn)
     _, content = output.make()
-    return Run(path or accumulate, Report(content), output.report_path)
+    return Run(path or request.accumulate, Report(content), output.report_path)

@@ -7,9 +7,10 @@ from pathlib import Path
 import pytest
 
 from mlbatch.batch.identity import session_key
-from mlbatch.batch.manifest import Common, chosen, parse_part, sessions_of
+from mlbatch.batch.manifest import Common, chosen, sessions_of
 from mlbatch.batch.session import OWN, Option, Session
 from mlbatch.errors import MlbatchError, RigError, UsageError
+from mlbatch.pipeline.job import Shard
 from mlbatch.rig.recipes import FOLDER
 
 SENSOR = "sensors: [{name: a, stream: {port: 7502}}]\n"
@@ -269,25 +270,21 @@ def sessions(names: str) -> list[Session]:
 
 @pytest.mark.parametrize("count", [1, 2, 3, 5, 9])
 def test_parts_are_disjoint_and_whole(count: int) -> None:
-    parts = [chosen(sessions("gfedcba"), (), (number, count)) for number in range(1, count + 1)]
+    parts = [
+        chosen(sessions("gfedcba"), (), Shard(number, count)) for number in range(1, count + 1)
+    ]
     assert sorted(one.name for part in parts for one in part) == list("abcdefg")
     sizes = [len(part) for part in parts]
     assert max(sizes) - min(sizes) <= 1
     # Not by the order in which patterns or the manifest have them.
-    again = chosen(sessions("abcdefg"), (), (1, count))
+    again = chosen(sessions("abcdefg"), (), Shard(1, count))
     assert {one.name for one in again} == {one.name for one in parts[0]}
 
 
 def test_only_names_sessions() -> None:
-    assert [one.name for one in chosen(sessions("ab"), ("b",), (1, 1))] == ["b"]
+    assert [one.name for one in chosen(sessions("ab"), ("b",), Shard(1, 1))] == ["b"]
     with pytest.raises(UsageError, match="nearest is drive"):
-        chosen([Session("drive", ())], ("driev",), (1, 1))
-
-
-@pytest.mark.parametrize("text", ["0/2", "3/2", "1", "a/b", "1/0", "-1/2", "1/2/3", ""])
-def test_wrong_parts_are_refused(text: str) -> None:
-    with pytest.raises(UsageError, match="--part 1/16"):
-        parse_part(text)
+        chosen([Session("drive", ())], ("driev",), Shard(1, 1))
 
 
 OWN_FILES = (

@@ -10,17 +10,19 @@ from functools import lru_cache
 from pathlib import Path
 
 from mlbatch import sensors
-from mlbatch.cli import values
 from mlbatch.discovery.match import ExpectedSensor, match_rig
 from mlbatch.discovery.sampler import Sampler
 from mlbatch.errors import MlbatchError
+from mlbatch.faults import parse_fault
 from mlbatch.frames.urdf import joints
 from mlbatch.pipeline import time_limits
-from mlbatch.python.options import choice, read_wait_ns
+from mlbatch.pipeline.job import wait_ns
+from mlbatch.python.options import box_m, choice
 from mlbatch.rig.rig import Rig, read_rig
 from mlbatch.rig.write import write_rig
 from mlbatch.sensors.options import check_options
 from mlbatch.types import StreamTable
+from mlbatch.units import parse_rate
 from tests.builders.sessions_of_bags import urdf
 from tests.contract.tree import ROOT
 from tests.fuzz.harness import BrokenLaw, Target
@@ -124,18 +126,20 @@ def _urdf(data: bytes, folder: Path) -> None:
 
 
 _TYPED: Sequence[tuple[Callable[[str], object], tuple[str, ...]]] = (
-    (values.rate, ("10", "29.97", "10/3", "1e1", "0.25")),
-    (values.box_m, ("-1,-1,0,1,1,2", "0,0,0,1,1,1", "-1e3,-1,0,1,1,2.5")),
-    (lambda text: read_wait_ns("--max-wait", text), ("1.0", "inf", "0.05", "1e9")),
+    (parse_rate, ("10", "29.97", "10/3", "1e1", "0.25")),
+    (
+        lambda text: box_m("--exclude-box", text),
+        ("-1,-1,0,1,1,2", "0,0,0,1,1,1", "-1e3,-1,0,1,1,2.5"),
+    ),
+    (lambda text: wait_ns("--max-wait", text), ("1.0", "inf", "0.05", "1e9")),
     (lambda text: time_limits.time_limit("--start", text), ("+12.5", "1700000000.5", "-3")),
     (lambda text: time_limits.time_limit("--end", text), ("2026-05-01T12:00:00Z", "2026-05-01")),
-    (lambda text: values.decode_options(text.split(";")), ("crc=check", "firing_azimuth=off;a=b")),
     (
         lambda text: check_options(dict(pair.partition("=")[::2] for pair in text.split(";"))),
         ("packet_stamp=end", "crc=check;optical_centre=on"),
     ),
     (
-        lambda text: values.faults(text.split(" ")),
+        lambda text: list(map(parse_fault, text.split(" "))),
         (
             *("drop:left:5%", "stall:left:5s-8s", "delay:left:60ms", "jump:left:37s@10s"),
             *("dup:left:1%", "reorder", "bitflip:*:0.1%", "drift:left:50ppm", "late:left:3s"),

@@ -19,13 +19,18 @@ from mlbatch.pipeline.conversion import Conversion
 from mlbatch.pipeline.job import Job, wait_ns
 from mlbatch.pipeline.passthrough import ImuQueue
 from mlbatch.pipeline.run import convert
-from mlbatch.reports.report import RunReport
 from mlbatch.types import EXTRAS, IMU, RunInfo, Scan
-from tests.builders.run import FIXTURE, TWO_LIDARS, Memory, in_memory
-from tests.builders.sessions import EPOCH_NS, NS_PER_MS, NS_PER_S, Unit, twin, write_session
-
-CAPTURE = TWO_LIDARS / "two_lidars.pcap"
-RIG = TWO_LIDARS / "rig.yaml"
+from tests.builders.run import FIXTURE, Memory, in_memory
+from tests.builders.sessions import (
+    CAPTURE,
+    EPOCH_NS,
+    NS_PER_MS,
+    NS_PER_S,
+    RIG,
+    Unit,
+    twin,
+    write_session,
+)
 
 
 def _job(capture: Path, **selection: bool) -> Job:
@@ -155,15 +160,6 @@ def test_a_dry_run_cuts_no_imu_samples_at_windows() -> None:
     assert all(ledger.imu_samples.written for ledger in ledgers)
 
 
-def test_a_dry_run_reports_the_same() -> None:
-    def sums(report: RunReport) -> list[object]:
-        return [report.scans, report.t_init_ns, *(sensor.ledger for sensor in report.sensors)]
-
-    job = replace(FIXTURE, extras=frozenset())
-    _, dry = convert(job, None)
-    assert sums(dry) == sums(convert(job, Memory)[1])
-
-
 def test_memory_does_not_grow_with_the_recording(tmp_path: Path) -> None:
     sizes = []
     for turns in (150, 600):
@@ -224,8 +220,8 @@ def test_scans_in_python_take_numbers_of_numpy() -> None:
 
 
 def test_the_shortest_wait_is_a_nanosecond() -> None:
-    assert wait_ns("max_wait", 1e-12, 1e-12) == 1
-    assert wait_ns("max_wait", 2e-9, 2e-9) == 2
+    assert wait_ns("max_wait", 1e-12) == 1
+    assert wait_ns("max_wait", 2e-9) == 2
 
 
 def test_scans_in_python_wait_for_ever_from_some_time_on() -> None:

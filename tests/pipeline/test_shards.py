@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from mlbatch.errors import UsageError
 from mlbatch.pipeline.job import Shard, parse_shard
 
 
@@ -23,4 +25,10 @@ def test_shards_have_the_same_number_of_files(count: int, each: int) -> None:
 @given(count=st.integers(1, 999_999), data=st.data())
 def test_a_shard_is_written_as_it_is_read(count: int, data: st.DataObject) -> None:
     shard = Shard(data.draw(st.integers(1, count)), count)
-    assert parse_shard(str(shard)) == shard
+    assert parse_shard("--shard", str(shard)) == shard
+
+
+@pytest.mark.parametrize("text", ["3/2", "2", "1/0", "a/b", "-1/2", "1/2/3", "٣/٤", ""])
+def test_what_is_no_shard(text: str) -> None:
+    with pytest.raises(UsageError, match=f"^--part: expected K/N .*found '{text}'; write"):
+        parse_shard("--part", text)

@@ -16,15 +16,14 @@ import pytest
 
 import mlbatch
 from mlbatch.errors import RecordingError, RigError, UsageError
+from mlbatch.pipeline.job import Job
+from mlbatch.python.options import output_job, session_job, window_job
 from mlbatch.python.recording import Recording
 from tests.builders.run import command
-from tests.builders.sessions import Unit, twin, write_session
+from tests.builders.sessions import CAPTURE, FIXTURE, RIG, Unit, twin, write_session
 from tests.contract.tree import ROOT, run_python
 from tests.python.test_dataset import assert_equal
 
-FIXTURE = ROOT / "fixtures" / "two_lidars"
-CAPTURE = FIXTURE / "two_lidars.pcap"
-RIG = FIXTURE / "rig.yaml"
 FOUR_RIG = ROOT / "fixtures/four_makers/rig.yaml"
 FIRST_NS = 1_777_881_600_100_000_000  # 2026-05-04T08:00:00.1Z, by SOURCE.md of the fixture
 PERIOD_NS = 100_000_000
@@ -371,12 +370,12 @@ def test_packets_of_no_sensor(rec: Recording) -> None:
     ("options", "expected"),
     [
         ({"layout": "flat"}, "layout: expected dense or organized, found 'flat'"),
-        ({"drop_incomplete": 101}, "drop_incomplete: expected a share from 0 to 100 %"),
+        ({"drop_incomplete": 101}, "drop_incomplete: expected a number from 0 to 100, found 101; "),
         ({"exclude_boxes": [(0, 0, 0, 1, 1)]}, "exclude_boxes: expected"),
-        ({"min_range": math.nan}, "min_range: expected 0 or more metres"),
-        ({"min_range": "0.5"}, "min_range: expected a number, found '0.5'"),
-        ({"max_range": None}, "max_range: expected a number, found None"),
-        ({"drop_incomplete": True}, "drop_incomplete: expected a number, found True"),
+        ({"min_range": math.nan}, "min_range: expected a number of 0 or more, found nan; "),
+        ({"min_range": "0.5"}, "min_range: expected a number of 0 or more, found '0.5'"),
+        ({"max_range": None}, "max_range: expected a number of 0 or more, found None"),
+        ({"drop_incomplete": True}, "drop_incomplete: expected a number from 0 to 100, found True"),
         ({"max_wait": "never"}, "max_wait: expected seconds above 0, or inf, found 'never'"),
         ({"max_wait": None}, "max_wait: expected seconds above 0, or inf, found None"),
         ({"exclude_boxes": [("a", "b")]}, "exclude_boxes: expected"),
@@ -385,7 +384,7 @@ def test_packets_of_no_sensor(rec: Recording) -> None:
         ({"deskew": "missing.tum"}, "--deskew: expected imu, constant-velocity or the file"),
         ({"deskew_to": "end"}, "--deskew-to: expected --deskew, which moves points"),
         ({"deskew": "imu", "deskew_to": "later"}, "deskew_to: expected start or middle or end"),
-        ({"batching": "newest"}, "batching: expected window, latest, approximate, collate"),
+        ({"batching": "newest"}, "batching: expected window or latest or approximate or collate"),
         ({"batching_times": "own"}, "batching-times: expected common for windows, found own"),
         *(
             ({"max_wait": seconds}, "max_wait: expected seconds above 0, or inf, found ")
@@ -406,6 +405,10 @@ def test_impossible_values(options: dict[str, object], expected: str, rec: Recor
         rec.scans(**options)  # type: ignore[arg-type]
     with pytest.raises(UsageError, match=expected):
         mlbatch.scans(CAPTURE, rig=RIG, **options)  # type: ignore[arg-type]
+
+
+def test_defaults_of_the_table_are_those_of_a_job() -> None:
+    assert output_job(window_job(session_job(CAPTURE, {}), {}), {}) == Job((CAPTURE,))
 
 
 def test_a_path_of_another_type() -> None:

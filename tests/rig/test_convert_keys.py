@@ -76,7 +76,7 @@ convert:
 
 
 def test_a_whole_number_without_an_upper_bound_may_be_large(tmp_path: Path) -> None:
-    key = key_of(Option("points", WHOLE, "Selection", "Points.", low=1))
+    key = key_of(Option("points", WHOLE, "Points.", low=1))
     assert key.form == {"type": "integer", "minimum": 1, "maximum": 2**31}
     file = tmp_path / "one.yaml"
     file.write_text("70000")
