@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from datetime import date
 from pathlib import Path
@@ -26,8 +26,8 @@ from mlbatch.pipeline.inspect import Inspection
 from mlbatch.pipeline.inspect import inspect as inspect_recordings
 from mlbatch.pipeline.job import Job
 from mlbatch.poses.calibration import Calibration
+from mlbatch.python.calibrate import CalibrateOptions, calibrate_job, check_output, rig_text
 from mlbatch.python.calibrate import calibrate as calibrate_rig
-from mlbatch.python.calibrate import calibrate_job, check_output, rig_text
 from mlbatch.python.dataset import Dataset, dataset_of
 from mlbatch.python.extract import ExtractOptions, extraction
 from mlbatch.python.options import (
@@ -35,8 +35,6 @@ from mlbatch.python.options import (
     ConvertOptions,
     Document,
     Documents,
-    Moment,
-    Names,
     Paths,
     Rate,
     ScanOptions,
@@ -167,26 +165,71 @@ def compare(
     tolerance, timeout: s; speed: of an object on the page, m/s.
     """
     session = session_job(recordings, {"rig": rig, "metadata": metadata, "clock": clock})
-    job = window_job(session, {"rate": rate})
-    for name, value in (("tolerance", tolerance), ("timeout", timeout), ("speed", speed)):
-        if not 0 < value < math.inf:
-            raise UsageError(f"{name}: expected a number above 0, found {value}; write 0.05")
-    page, folder = path_of("html", html), path_of("figures", figures)
-    if page is not None:
-        check_page(page, overwrite=overwrite)
-    if folder is not None:
-        check_figures(folder, overwrite=overwrite)
-    settings = Settings(round(tolerance * NS_PER_S), round(timeout * NS_PER_S))
-    found = compare_policies(job, settings, finds_instant=page is not None)
+    found, _ = run_comparison(
+        window_job(session, {"rate": rate}),
+        tolerance=tolerance,
+        timeout=timeout,
+        html=path_of("html", html),
+        figures=path_of("figures", figures),
+        speed=speed,
+        overwrite=overwrite,
+    )
+    return found
+
+
+def run_comparison(
+    job: Job,
+    *,
+    tolerance: float | str,
+    timeout: float | str,
+    html: Path | None,
+    figures: Path | None,
+    speed: float | str,
+    overwrite: bool,
+    shown: Callable[[str], str] = str,
+    show: Callable[[str], object] | None = None,
+    command: str = "mlbatch.compare",
+    progress: Progress | None = None,
+) -> tuple[Comparison, list[Path]]:
+    """Compare policies on the recordings of a job; write the page and the figures asked for.
+
+    shown: the name of an option in errors; show: takes the page instead of a file. Returns the
+    paths of what was written, too.
+    """
+    settings = Settings(
+        round(_above_0(shown("tolerance"), tolerance, "seconds", "0.05") * NS_PER_S),
+        round(_above_0(shown("timeout"), timeout, "seconds", "0.05") * NS_PER_S),
+    )
+    speed_mps = _above_0(shown("speed"), speed, "m/s", "10")
+    if html is not None:
+        check_page(html, overwrite=overwrite)
+    if figures is not None:
+        check_figures(figures, overwrite=overwrite)
+    has_page = html is not None or show is not None
+    found = compare_policies(job, settings, progress, finds_instant=has_page)
     policies = found.figures()
-    if folder is not None:
-        write_figures(folder, policies)
-    if page is not None:
+    written = [] if figures is None else write_figures(figures, policies)
+    if has_page:
         names = ", ".join(path.name for path in job.recordings)
         notes = [f"{note.code}: {note.message}" for note in found.notes]
-        words = (names, found.title(), policies, notes, "mlbatch.compare")
-        write_text_page(page, comparison_page(*words, found.instant, speed))
-    return found
+        words = (names, found.title(), policies, notes, command)
+        page = comparison_page(*words, found.instant, speed_mps)
+        if html is not None:
+            write_text_page(html, page)
+            written.append(html)
+        if show is not None:
+            show(page)
+    return found, written
+
+
+def _above_0(option: str, value: float | str, unit: str, example: str) -> float:
+    try:
+        number = float(value)
+    except ValueError:
+        number = math.nan
+    if not 0 < number < math.inf:
+        raise UsageError(f"{option}: expected {unit} above 0, found {value!r}; write {example}")
+    return number
 
 
 def dataset(*outputs: Paths) -> Dataset:
@@ -206,21 +249,17 @@ def inspect(recordings: Paths, metadata: Documents = (), *, whole: bool = False)
     return inspect_recordings(paths, metadata_paths(metadata), whole=whole)
 
 
+@documented(CalibrateOptions)
 def calibrate(
     recordings: Paths,
     rig: Document,
     output: AnyPath | None = None,
     *,
-    metadata: Documents = (),
-    only: Names = (),
-    clock: str = "sensor",
-    align_clocks: bool = False,
-    start: Moment | None = None,
-    end: Moment | None = None,
     time_offset: bool = False,
     from_motion: bool = False,
     html: AnyPath | None = None,
     overwrite: bool = False,
+    **options: Unpack[CalibrateOptions],
 ) -> Calibration:
     """Refine the poses of a rig's lidars, as `mlbatch calibrate` does; write rig and page if asked.
 
@@ -230,17 +269,8 @@ def calibrate(
     guess = rig_path(rig)
     if guess is None:
         raise UsageError("rig: expected a path or a mapping, found None; give the guess")
-    job = calibrate_job(
-        recordings,
-        guess,
-        metadata=metadata,
-        only=only,
-        clock=clock,
-        align_clocks=align_clocks,
-        start=start,
-        end=end,
-        from_motion=from_motion,
-    )
+    check_names("mlbatch.calibrate", options, CalibrateOptions)
+    job = calibrate_job(recordings, guess, options, from_motion=from_motion)
     return run_calibration(
         job,
         path_of("output", output),

@@ -6,11 +6,11 @@ import json
 import shlex
 import sys
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any, cast
 
 import typer
 
-from mlbatch.cli.parameters import AsJson, Clock, Metadata, Recordings, Verbose
+from mlbatch.cli.parameters import AsJson, Recordings, Verbose, shared, with_parameters
 from mlbatch.errors import one_line
 
 
@@ -28,22 +28,6 @@ def calibrate(
         Path | None,
         typer.Option("-o", "--output", help="Rig file to write.  [default: none]", metavar="FILE"),
     ] = None,
-    metadata: Metadata = None,
-    only: Annotated[
-        list[str] | None,
-        typer.Option(help="Only this sensor, by name or serial; repeatable.", metavar="SENSOR"),
-    ] = None,
-    clock: Clock = "sensor",
-    align_clocks: Annotated[
-        bool, typer.Option("--align-clocks", help="Align clocks that are not synchronised.")
-    ] = False,
-    start: Annotated[
-        str | None,
-        typer.Option(help="First time: ISO, epoch seconds, +S from the start.", metavar="TIME"),
-    ] = None,
-    end: Annotated[
-        str | None, typer.Option(help="Time to stop before, as --start.", metavar="TIME")
-    ] = None,
     time_offset: Annotated[
         bool,
         typer.Option("--time-offset", help="Also find the delay of each lidar's timestamps."),
@@ -54,35 +38,20 @@ def calibrate(
             "--from-motion", help="Begin with poses by the motion of each lidar, without a guess."
         ),
     ] = False,
-    html: Annotated[
-        Path | None,
-        typer.Option(help="Also write a page (HTML): before and after.", metavar="FILE"),
-    ] = None,
-    overwrite: Annotated[
-        bool, typer.Option("--overwrite", help="Replace an existing rig file and page.")
-    ] = False,
     as_json: AsJson = False,
     verbose: Verbose = False,
+    **values: Any,
 ) -> None:
     """Refine the poses of a rig's lidars by the surfaces that they share."""
     from mlbatch.api import run_calibration
     from mlbatch.cli.progress import progress_bar
     from mlbatch.cli.tables import paragraph, table_lines
     from mlbatch.cli.values import long_name
-    from mlbatch.python.calibrate import calibrate_job
+    from mlbatch.python.calibrate import CalibrateOptions, calibrate_job
 
-    job = calibrate_job(
-        tuple(recordings),
-        rig,
-        metadata=tuple(metadata or ()),
-        only=tuple(only or ()),
-        clock=clock,
-        align_clocks=align_clocks,
-        start=start,
-        end=end,
-        from_motion=from_motion,
-        shown=long_name,
-    )
+    html, overwrite = values.pop("html"), values.pop("overwrite")
+    options = cast(CalibrateOptions, values)
+    job = calibrate_job(tuple(recordings), rig, options, from_motion=from_motion, shown=long_name)
     with progress_bar("calibrate", is_verbose=verbose) as progress:
         found = run_calibration(
             job,
@@ -109,3 +78,16 @@ def calibrate(
     for path in (output, html):
         if path is not None:
             typer.echo(one_line(f"wrote {path}"))
+
+
+with_parameters(
+    calibrate,
+    shared(
+        *("metadata", "only", "clock", "align_clocks", "start", "end", "html", "overwrite"),
+        start="First time: ISO, epoch seconds, +S from the start.",
+        end="Time to stop before, as --start.",
+        align_clocks="Align clocks that are not synchronised.",
+        html="Also write a page (HTML): before and after.",
+        overwrite="Replace an existing rig file and page.",
+    ),
+)

@@ -3,37 +3,27 @@
 from __future__ import annotations
 
 import json
-import math
 import shlex
 import sys
-from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated, Any, cast
 
 import typer
 
-from mlbatch.cli.parameters import AsJson, Clock, Metadata, Recordings, Verbose, is_stdout
+from mlbatch.cli.parameters import (
+    AsJson,
+    Recordings,
+    Verbose,
+    is_stdout,
+    shared,
+    with_parameters,
+)
 from mlbatch.errors import UsageError, one_line
-from mlbatch.options import CLOCKS
-from mlbatch.units import NS_PER_S
-
-if TYPE_CHECKING:
-    from mlbatch.comparison.compare import Comparison
 
 
 def compare(
     recordings: Recordings,
-    rig: Annotated[
-        Path | None, typer.Option("--rig", "-r", help="Rig file (YAML).", metavar="FILE")
-    ] = None,
-    rate: Annotated[
-        str | None,
-        typer.Option(
-            help="Windows per second, Hz: 10, 29.97.  [default: rig's, or 10]", metavar="HZ"
-        ),
-    ] = None,
-    metadata: Metadata = None,
-    clock: Clock = "sensor",
     tolerance: Annotated[
         str,
         typer.Option(
@@ -44,10 +34,6 @@ def compare(
         str,
         typer.Option(help="Timeout collate: a set is closed after this many s.", metavar="S"),
     ] = "0.1",
-    html: Annotated[
-        Path | None,
-        typer.Option(help="Also write a page (HTML) with plots; -: print only it.", metavar="FILE"),
-    ] = None,
     figures: Annotated[
         Path | None,
         typer.Option(
@@ -62,60 +48,47 @@ def compare(
             show_default=False,
         ),
     ] = None,
-    overwrite: Annotated[
-        bool, typer.Option("--overwrite", help="Replace an existing page and figures.")
-    ] = False,
     as_json: AsJson = False,
     verbose: Verbose = False,
+    **values: Any,
 ) -> None:
     """Compare frame-level fusion of lidars with windows: time spans, columns, stale data."""
+    from mlbatch.api import run_comparison
     from mlbatch.cli.progress import progress_bar
     from mlbatch.cli.tables import paragraph, table_lines
-    from mlbatch.cli.values import rate as read_rate
-    from mlbatch.comparison.compare import Settings, compare
-    from mlbatch.discovery.discover import SensorSelection
+    from mlbatch.cli.values import long_name
     from mlbatch.page.policies import DEFAULT_MPS
-    from mlbatch.pipeline.job import Job
-    from mlbatch.python.options import choice
-    from mlbatch.readers.inputs import expand
+    from mlbatch.python.options import ScanOptions, session_job, window_job
 
-    choice("--clock", clock, CLOCKS)
-    settings = Settings(
-        round(_above_0("--tolerance", tolerance, "seconds", "0.05") * NS_PER_S),
-        round(_above_0("--timeout", timeout, "seconds", "0.05") * NS_PER_S),
-    )
-    speed_mps = DEFAULT_MPS if speed is None else _above_0("--speed", speed, "m/s", "10")
+    html = values.pop("html")
+    prints_page = is_stdout(html)
     if speed is not None and html is None:
         raise UsageError("--speed: expected a page to print it on, found none; add --html FILE")
-    selection = SensorSelection(rig=rig, metadata=tuple(metadata or ()), host_clock=clock == "host")
-    job = Job(expand(recordings), selection, rate=None if rate is None else read_rate(rate))
-    prints_page = is_stdout(html)
     if prints_page and as_json:
         raise UsageError(
             "--html -: expected standard output for the page alone, found --json; leave one out"
         )
-    if html is not None and not prints_page:
-        from mlbatch.page import check_page
-
-        check_page(html, overwrite=overwrite)
-    if figures is not None:
-        from mlbatch.comparison.figures import check_figures
-
-        check_figures(figures, overwrite=overwrite)
+    overwrite = values.pop("overwrite")
+    options = cast(ScanOptions, values)
+    session = session_job(tuple(recordings), options, long_name)
     with progress_bar("compare", is_verbose=verbose) as progress:
-        found = compare(job, settings, progress, finds_instant=html is not None)
+        found, written = run_comparison(
+            window_job(session, options, long_name),
+            tolerance=tolerance,
+            timeout=timeout,
+            html=None if prints_page else html,
+            figures=figures,
+            speed=DEFAULT_MPS if speed is None else speed,
+            overwrite=overwrite,
+            shown=long_name,
+            show=partial(typer.echo, nl=False) if prints_page else None,
+            command=shlex.join(["mlbatch", *sys.argv[1:]]),
+            progress=progress,
+        )
     for note in found.notes:
         typer.echo(one_line(f"mlbatch: warning: {note.code}: {note.message}"), err=True)
-    written = _write_figures(found, figures)
-    if html is not None:
-        page = _page(found, job.recordings, speed_mps)
-        if prints_page:
-            typer.echo(page, nl=False)
-            return
-        from mlbatch.page import write_text_page
-
-        write_text_page(html, page)
-        written.append(html)
+    if prints_page:
+        return
     if as_json:
         typer.echo(json.dumps(found.as_json(), indent=1))
         return
@@ -126,29 +99,12 @@ def compare(
         typer.echo(one_line(f"wrote {path}"))
 
 
-def _write_figures(found: Comparison, folder: Path | None) -> list[Path]:
-    if folder is None:
-        return []
-    from mlbatch.comparison.figures import write_figures
-
-    return write_figures(folder, found.figures())
-
-
-def _page(found: Comparison, recordings: Sequence[Path], speed_mps: float) -> str:
-    from mlbatch.page.comparison import comparison_page
-
-    title = ", ".join(path.name for path in recordings)
-    notes = [f"{note.code}: {note.message}" for note in found.notes]
-    command = shlex.join(["mlbatch", *sys.argv[1:]])
-    figures = found.figures()
-    return comparison_page(title, found.title(), figures, notes, command, found.instant, speed_mps)
-
-
-def _above_0(option: str, text: str, unit: str, example: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = math.nan
-    if not 0 < value < math.inf:
-        raise UsageError(f"{option}: expected {unit} above 0, found {text!r}; write {example}")
-    return value
+with_parameters(
+    compare,
+    shared(
+        *("rig", "rate", "metadata", "clock", "html", "overwrite"),
+        rate="Windows per second, Hz: 10, 29.97.  [default: rig's, or 10]",
+        html="Also write a page (HTML) with plots; -: print only it.",
+        overwrite="Replace an existing page and figures.",
+    ),
+)

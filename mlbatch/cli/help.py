@@ -24,6 +24,7 @@ Rows = list[tuple[str, str]]
 _OTHERS: Mapping[str, str] = {
     **{"recordings": "Input", "whole": "Input", "tolerance": "Batching", "timeout": "Batching"},
     **{name: "Output" for name in ("figures", "as_json", "write_rig")},
+    "duration": "Selection",
     "help": "Run",
 }
 _GROUP_OF = {
@@ -49,7 +50,7 @@ COMMON: Mapping[str, frozenset[str]] = {
 }
 HELP_ALL = "--help-all"
 # Commands with few options have no groups.
-GROUPED = ("convert", "inspect", "compare")
+GROUPED = ("convert", "inspect", "compare", "extract", "calibrate")
 
 
 def groups_of(command: Any, context: Any) -> dict[str, Rows]:

@@ -4,27 +4,16 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
-from mlbatch.cli.parameters import AsJson, Metadata, Recordings, Verbose
+from mlbatch.cli.parameters import AsJson, Recordings, Verbose, shared, with_parameters
 from mlbatch.errors import one_line
 
 
 def inspect(
     recordings: Recordings,
-    metadata: Metadata = None,
-    rig: Annotated[
-        Path | None,
-        typer.Option(
-            "--rig", "-r", help="Rig file (YAML): its sensors, names and poses.", metavar="FILE"
-        ),
-    ] = None,
-    dataset: Annotated[
-        str | None,
-        typer.Option(help="Rig of a public dataset, by name (mlbatch datasets).", metavar="NAME"),
-    ] = None,
     whole: Annotated[
         bool,
         typer.Option("--whole", help="Packets, loss and clocks of the whole recording, not 10 s."),
@@ -37,6 +26,7 @@ def inspect(
         ),
     ] = None,
     verbose: Verbose = False,
+    **values: Any,
 ) -> None:
     """Show streams, sensors, modes, rates, loss, clocks and extrinsics (from the first 10 s)."""
     from mlbatch.cli.progress import progress_bar
@@ -44,10 +34,11 @@ def inspect(
     from mlbatch.pipeline.inspect import inspect as inspect_recordings
     from mlbatch.readers.inputs import expand
 
-    if dataset is not None:
+    rig = values["rig"]
+    if values["dataset"] is not None:
         from mlbatch.rig.recipes import rig_of
 
-        rig = rig_of(rig, dataset)
+        rig = rig_of(rig, values["dataset"])
     prints_rig = write_rig == Path("-")
     if prints_rig and as_json:
         from mlbatch.errors import UsageError
@@ -57,7 +48,11 @@ def inspect(
         )
     with progress_bar("inspect", is_shown=whole, is_verbose=verbose) as progress:
         found = inspect_recordings(
-            expand(recordings), tuple(metadata or ()), rig=rig, whole=whole, progress=progress
+            expand(recordings),
+            tuple(values["metadata"] or ()),
+            rig=rig,
+            whole=whole,
+            progress=progress,
         )
     if prints_rig:
         typer.echo(found.rig_text(Path()), nl=False)
@@ -95,6 +90,12 @@ def inspect(
         typer.echo(paragraph(f"note: {note}"))
     if write_rig is not None:
         typer.echo(one_line(f"wrote {write_rig}"))
+
+
+with_parameters(
+    inspect,
+    shared("rig", "dataset", "metadata", rig="Rig file (YAML): its sensors, names and poses."),
+)
 
 
 def _print(*lines: str) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import inspect
 import keyword
 from collections.abc import Callable, Iterable
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any, TypeAlias
 
@@ -49,21 +50,6 @@ Recordings: TypeAlias = Annotated[
     typer.Argument(
         help="Recordings of one session: pcap, pcapng, MCAP, ROS bags; folders of them; "
         "patterns in quotes ('*.pcap')."
-    ),
-]
-Metadata: TypeAlias = Annotated[
-    list[Path] | None,
-    typer.Option(
-        *("--metadata", "-m"),
-        help="Metadata or calibration; repeatable.  [default: next to RECORDING]",
-        metavar="FILE",
-    ),
-]
-Clock: TypeAlias = Annotated[
-    str,
-    one_of(
-        *(options.CLOCKS, "--clock"),
-        help="sensor: timestamps of the packets; host: their receive times.",
     ),
 ]
 Verbose: TypeAlias = Annotated[
@@ -117,6 +103,22 @@ def parameter(option: Option) -> inspect.Parameter:
         default=option.default,
         annotation=Annotated[kind if option.default is not None else kind | None, info],
     )
+
+
+def shared(*names: str, **about: str) -> list[inspect.Parameter]:
+    """Parameters of options that another command shares with `convert`; about: its help of some."""
+    rows = (options.BY_NAME[name] for name in names)
+    return [
+        parameter(
+            replace(
+                row,
+                about=about.get(row.name, row.about),
+                # Without synonyms.
+                flags=tuple(flag for flag in row.flags if not flag.startswith("--")),
+            )
+        )
+        for row in rows
+    ]
 
 
 def with_parameters(command: Callable[..., None], added: Iterable[inspect.Parameter]) -> None:

@@ -9,6 +9,7 @@ from datetime import date
 from functools import partial
 from itertools import islice
 from pathlib import Path
+from typing import TypedDict, cast
 
 import numpy as np
 
@@ -58,6 +59,7 @@ from mlbatch.python.options import (
     Moment,
     Names,
     Paths,
+    ScanOptions,
     recordings_of,
     session_job,
     window_job,
@@ -78,35 +80,31 @@ _MOST_TURNS = 300
 _LEVEL_DEG = 2.0
 
 
+class CalibrateOptions(TypedDict, total=False):
+    """Options that select recordings, lidars and times, with the names of `mlbatch calibrate`."""
+
+    metadata: Documents | None
+    only: Names | None
+    clock: str
+    align_clocks: bool
+    start: Moment | None
+    end: Moment | None
+
+
 def calibrate_job(
     recordings: Paths | tuple[Paths, ...],
     rig: Path,
+    options: CalibrateOptions,
     *,
-    metadata: Documents = (),
-    clock: str = "sensor",
-    align_clocks: bool = False,
-    only: Names = (),
-    start: Moment | None = None,
-    end: Moment | None = None,
     from_motion: bool = False,
     shown: Callable[[str], str] = str,
 ) -> Job:
     """The job whose scans a calibration reads; shown: the name of an option in errors."""
     if not from_motion:
         _refuse_unknown(rig, recordings_of(recordings))
-    session = session_job(
-        recordings,
-        {
-            "rig": rig,
-            "metadata": metadata,
-            "clock": clock,
-            "align_clocks": align_clocks,
-            "only": only,
-            "identity_extrinsics": from_motion,
-        },
-        shown,
-    )
-    job = window_job(session, {"rate": _RATE, "start": start, "end": end}, shown)
+    more = {"rig": rig, "identity_extrinsics": from_motion, "rate": _RATE}
+    values = cast(ScanOptions, {**options, **more})
+    job = window_job(session_job(recordings, values, shown), values, shown)
     # It checks nothing that a calibration does not measure.
     return replace(job, min_range_m=LEAST_RANGE_M, max_range_m=MOST_RANGE_M, checks_poses=False)
 

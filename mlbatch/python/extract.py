@@ -30,13 +30,13 @@ class ExtractOptions(TypedDict, total=False):
     """Options with the names of `mlbatch extract`; duration: s; copy_topics: as `--pass`."""
 
     rig: Document | None
-    metadata: Documents
-    only: Names
-    ignore: Names
+    metadata: Documents | None
+    only: Names | None
+    ignore: Names | None
     start: Moment | None
     end: Moment | None
     duration: float | None
-    copy_topics: Names
+    copy_topics: Names | None
     overwrite: bool
 
 
@@ -61,14 +61,14 @@ def extraction(
         target,
         SensorSelection(
             rig=rig_path(options.get("rig")),
-            metadata=metadata_paths(options.get("metadata", ())),
-            only=names_of(options.get("only", ())),
-            ignore=names_of(options.get("ignore", ())),
+            metadata=metadata_paths(options.get("metadata")),
+            only=names_of(options.get("only")),
+            ignore=names_of(options.get("ignore")),
         ),
         start,
         end,
         duration_ns,
-        names_of(options.get("copy_topics", ())),
+        names_of(options.get("copy_topics")),
         options.get("overwrite", False),
     )
 

@@ -177,7 +177,7 @@ def test_the_rig_reads_back_to_the_last_digit(
         + "exclude_boxes_m: [[-1, -1, -1, 1, 1, 1]]\nconvert: {layout: organized}\n",
         encoding="utf-8",
     )
-    job = calibrate_job(room.path, guess)
+    job = calibrate_job(room.path, guess, {})
     text = rig_text(job, calibration, tmp_path, date(2026, 5, 4))
     (tmp_path / "rig.yaml").write_text(text, encoding="utf-8")
     before, after = read_rig(guess), read_rig(tmp_path / "rig.yaml")
@@ -199,7 +199,7 @@ def test_delays_become_offsets_of_the_clock(
 ) -> None:
     left, right = calibration.lidars
     late = replace(calibration, lidars=(left, replace(right, delay_ms=-12.5)))
-    text = rig_text(calibrate_job(room.path, room.rig), late, tmp_path, date(2026, 5, 4))
+    text = rig_text(calibrate_job(room.path, room.rig, {}), late, tmp_path, date(2026, 5, 4))
     (tmp_path / "rig.yaml").write_text(text, encoding="utf-8")
     assert [sensor.offset_ns for sensor in read_rig(tmp_path / "rig.yaml").sensors] == [
         0,
