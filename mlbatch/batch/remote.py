@@ -17,7 +17,7 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence
 from datetime import timedelta
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
@@ -67,7 +67,7 @@ class _Place(NamedTuple):
 
 
 def _place(url: str) -> _Place:
-    """The store of a URL; UsageError without obstore, which is imported after this."""
+    """The store of a URL; UsageError without obstore."""
     scheme, _, rest = url.partition("://")
     bucket, _, path = rest.partition("/")
     root = f"{scheme}://{bucket}"
@@ -102,11 +102,17 @@ def _store(root: str) -> Any:
         ) from err
 
 
-def _repeated(url: str, call: Callable[[], T]) -> T:
-    """Repeat a request until it succeeds; RecordingError in the end, or at once if it is final."""
+def _request(url: str, call: Callable[[Any, _Place], T]) -> T:
+    """Repeat a request until it succeeds; RecordingError in the end, or at once if it is final.
+
+    call: with the package obstore, and the place of the URL.
+    """
+    place = _place(url)
+    import obstore
+
     for wait_s in (*_WAITS_S, None):
         try:
-            return call()
+            return call(obstore, place)
         except Exception as err:
             if isinstance(err, MlbatchError):
                 raise
@@ -138,11 +144,8 @@ def _first_line(err: Exception) -> str:
 
 def head(url: str) -> RemoteFile:
     """Size and version of a file; RecordingError without one."""
-    place = _place(url)
-    import obstore
-
-    found = _repeated(url, lambda: obstore.head(place.store, place.path))
-    return _remote_file(place.root, found, url)
+    found = _request(url, lambda obstore, place: obstore.head(place.store, place.path))
+    return _remote_file("", found, url)
 
 
 def _remote_file(root: str, meta: Any, url: str = "") -> RemoteFile:
@@ -156,14 +159,12 @@ def listed(url: str) -> list[RemoteFile]:
     """All files below a folder, by name; none of a web server, which has no lists."""
     if url.partition("://")[0] in _WEB:
         return []
-    place = _place(url if url.endswith("/") else f"{url}/")
-    import obstore
 
-    def pages() -> list[RemoteFile]:
+    def pages(obstore: Any, place: _Place) -> list[RemoteFile]:
         batches = obstore.list(place.store, prefix=place.path.rstrip("/") or None)
         return [_remote_file(place.root, meta) for batch in batches for meta in batch]
 
-    return sorted(_repeated(url, pages))
+    return sorted(_request(f"{url.rstrip('/')}/", pages))
 
 
 def with_calibrations(urls: Sequence[str]) -> list[RemoteFile]:
@@ -323,26 +324,23 @@ def download(file: RemoteFile, target: Path) -> None:
 
     A copy that was interrupted continues.
     """
-    place = _place(file.url)
-    import obstore
-
     target.parent.mkdir(parents=True, exist_ok=True)
-    partial = target.with_name(f"{target.name}.partial")
-    with partial.open("ab") as copy:
+    part = target.with_name(f"{target.name}.partial")
+    with part.open("ab") as copy:
         at = copy.tell()
         while at < file.size:
             length = min(_BLOCK_BYTES, file.size - at)
-            data = _repeated(file.url, _range(obstore, place, at, length))
+            data = _request(file.url, partial(_range, at, length))
             copy.write(data)
             at += len(data)
     if at != file.size:
-        partial.unlink()
+        part.unlink()
         raise RecordingError(
             f"{file.url}: expected {file.size} bytes, found {at}; it changed meanwhile: try again"
         )
     # A later copy is the same input to `convert --resume`.
-    os.utime(partial, ns=(file.changed_ns, file.changed_ns))
-    partial.replace(target)
+    os.utime(part, ns=(file.changed_ns, file.changed_ns))
+    part.replace(target)
 
 
 @contextlib.contextmanager
@@ -367,40 +365,27 @@ def local_output(name: str) -> Iterator[Path]:
         yield Path(place, url.rpartition("/")[2])
 
 
-def _range(obstore: Any, place: _Place, at: int, length: int) -> Callable[[], bytes]:
-    def read() -> bytes:
-        data = bytes(obstore.get_range(place.store, place.path, start=at, length=length))
-        if len(data) != length:
-            raise OSError(f"{len(data)} bytes instead of {length}")
-        return data
-
-    return read
+def _range(at: int, length: int, obstore: Any, place: _Place) -> bytes:
+    data = bytes(obstore.get_range(place.store, place.path, start=at, length=length))
+    if len(data) != length:
+        raise OSError(f"{len(data)} bytes instead of {length}")
+    return data
 
 
 def upload(path: Path, url: str) -> None:
     """Copy a file to a store, in parts; it appears complete or not at all."""
-    place = _place(url)
-    import obstore
-
-    _repeated(url, lambda: obstore.put(place.store, place.path, path))
+    _request(url, lambda obstore, place: obstore.put(place.store, place.path, path))
 
 
 def read_text(url: str) -> str:
     """The text of a small file; "" without one."""
-    place = _place(url)
-    import obstore
-
     with contextlib.suppress(RecordingError):
-        return bytes(_repeated(url, lambda: obstore.get(place.store, place.path).bytes())).decode(
-            "utf-8", "replace"
-        )
+        data = _request(url, lambda obstore, place: obstore.get(place.store, place.path).bytes())
+        return bytes(data).decode("utf-8", "replace")
     return ""
 
 
 def remove(url: str) -> None:
     """Remove a file, if it exists."""
-    place = _place(url)
-    import obstore
-
     with contextlib.suppress(RecordingError):
-        _repeated(url, lambda: obstore.delete(place.store, place.path))
+        _request(url, lambda obstore, place: obstore.delete(place.store, place.path))

@@ -192,24 +192,6 @@ class Integrator:
         return PoseTrack(stamp_ns, body, position_m + arm, self._name)
 
 
-def integrated(
-    stamp_ns: I64Array,
-    force: F64Array,
-    rate: F64Array,
-    body_from_imu: F64Array,
-    name: str = "imu",
-) -> PoseTrack:
-    """Return the track of the body from all samples of an IMU, as `Integrator.push`.
-
-    RecordingError if they are shorter than the standstill.
-    """
-    integrator = Integrator(body_from_imu, name)
-    track = integrator.push(stamp_ns, force, rate)
-    if not len(track.stamp_ns):
-        standstill(stamp_ns, force, rate, name)
-    return track
-
-
 def _summed(begin: F64Array, rates: F64Array, step_s: F64Array) -> F64Array:
     """Return integrals (n + 1, 3) of rates (n + 1, 3) by the trapezoidal rule, from (3,)."""
     steps = 0.5 * (rates[1:] + rates[:-1]) * step_s[:, None]

@@ -20,6 +20,7 @@ from mlbatch.motion.estimate import Estimate, VelocityEstimator
 from mlbatch.motion.moves import PoseLine
 from mlbatch.motion.registration import ORIGIN, ColumnCloud
 from mlbatch.motion.track import PoseTrack
+from mlbatch.pipeline.decode_pool import first_ring_index
 from mlbatch.reports.motion import MotionLedger, VelocityCounts
 from mlbatch.types import ImuSamples, Message, Scan, WindowColumns, instant_ns
 from mlbatch.units import NS_PER_S
@@ -71,8 +72,7 @@ class WindowPoints:
 
     def oldest_ring_index(self, sensor: int) -> int | None:
         """First ring index of a sensor in the slices that wait; None: none."""
-        parts = (one.columns.ring_index[one.columns.sensor == sensor] for one in self._slices)
-        return min((int(part.min()) for part in parts if len(part)), default=None)
+        return first_ring_index(self._slices, sensor)
 
     def _span_ns(self, window: Window) -> tuple[int, int]:
         """Start and end of the whole window that a slice belongs to; of a set of sweeps its own."""

@@ -170,7 +170,7 @@ class Conversion:
             cutters = [sweep_cutter(sensor) for sensor in self.sensors]
             self.fusion = SweepFusion(job.batching, cutters, merge)
         self.passthrough = Passthrough(self.sensors, job)
-        self.passthrough.refuse_unknown(self.session.recordings)
+        self.passthrough.messages.refuse_unknown(self.session.recordings)
         self.info: RunInfo | None = None
         self.table: ScanTable | None = None
         self.users: list[PacketUser] = []
@@ -264,7 +264,7 @@ class Conversion:
         Section 2.1 of Faitli et al. (2025): the columns of all sensors are taken by timestamp,
         smallest first, and cut at the bounds of an absolute grid.
         """
-        self.passthrough.subscribe(self.session.recordings)
+        self.passthrough.messages.subscribe(self.session.recordings)
         if progress is not None:
             # A pass begins: that of `--align-clocks` came before.
             progress(0, self.session.size_bytes, 0)

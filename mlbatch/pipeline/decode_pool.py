@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple, TypeAlias
 
@@ -194,6 +194,12 @@ class DecodePool:
         for worker in self.workers:
             total.add(worker.points[sensor].counters)
         return total
+
+
+def first_ring_index(windows: Iterable[Window], sensor: int) -> int | None:
+    """First ring index of a sensor in windows that wait; None: none."""
+    parts = (one.columns.ring_index[one.columns.sensor == sensor] for one in windows)
+    return min((int(part.min()) for part in parts if len(part)), default=None)
 
 
 def _last(sensors: I64Array, sensor: int) -> int | None:

@@ -26,6 +26,7 @@ from mlbatch.motion.moves import PoseLine
 from mlbatch.motion.track import PoseTrack
 from mlbatch.motion.tum import read_tum
 from mlbatch.pipeline.constant_velocity import WindowPoints
+from mlbatch.pipeline.decode_pool import first_ring_index
 from mlbatch.pipeline.passthrough import IMU_TYPE, NEAR_NS
 from mlbatch.pipeline.rotation_check import RotationCheck
 from mlbatch.pipeline.sensor import Sensor
@@ -354,8 +355,7 @@ class Deskew:
 
     def oldest_ring_index(self, sensor: int) -> int | None:
         """First ring index of a sensor in the windows that wait; None: none."""
-        parts = (one.columns.ring_index[one.columns.sensor == sensor] for one in self._waiting)
-        return min((int(part.min()) for part in parts if len(part)), default=None)
+        return first_ring_index(self._waiting, sensor)
 
     @property
     def ledger(self) -> MotionLedger:

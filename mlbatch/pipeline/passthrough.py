@@ -65,14 +65,6 @@ class Passthrough:
             job.passed, MESSAGE_ENCODINGS & job.extras, job.segment.begin_ns
         )
 
-    def refuse_unknown(self, recordings: Sequence[Recording]) -> None:
-        """Raise UsageError for a pattern that matches no topic of the recordings."""
-        self.messages.refuse_unknown(recordings)
-
-    def subscribe(self, recordings: Iterable[Recording]) -> None:
-        """Ask the recordings for the messages to forward."""
-        self.messages.subscribe(recordings)
-
     def add(
         self, imu: Iterable[ImuSamples], messages: Iterable[Message], limits_ns: TimeLimits
     ) -> None:
