@@ -56,15 +56,22 @@ BY_HOST = replace(FIXTURE, selection=replace(FIXTURE.selection, host_clock=True)
 
 
 @dataclass(frozen=True, slots=True)
-class Told:
-    """Output of a command, and its exit code."""
+class Outcome:
+    """Exit code of a command, and what it printed."""
 
     code: int
     out: str
     err: str
 
+    @property
+    def warnings(self) -> list[str]:
+        """Codes of the warnings on stderr."""
+        mark = "mlbatch: warning: "
+        lines = [line for line in self.err.splitlines() if line.startswith(mark)]
+        return [line.removeprefix(mark).split(":")[0] for line in lines]
 
-def command(*words: str | Path) -> Told:
+
+def command(*words: str | Path) -> Outcome:
     """Run `mlbatch` with these words in this process."""
     out = io.StringIO()
     err = io.StringIO()
@@ -82,7 +89,7 @@ def command(*words: str | Path) -> Told:
         code = leave.code
     finally:
         sys.argv = before
-    return Told(code if isinstance(code, int) else 0, out.getvalue(), err.getvalue())
+    return Outcome(code if isinstance(code, int) else 0, out.getvalue(), err.getvalue())
 
 
 @dataclass(slots=True)

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import json
 import shlex
-import sys
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -16,14 +15,17 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from mlbatch.cli import app, main
 from mlbatch.simulate.ouster.encode import OusterSpec, encode_frame, imu_packet, metadata_json
 from mlbatch.writers import atomic
 from tests.builders.captures import udp_frame, write_pcap
-from tests.builders.parser import parser
+from tests.builders.run import Outcome, command
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 FIXTURE = REPOSITORY / "fixtures" / "two_lidars"
+CAPTURE = FIXTURE / "two_lidars.pcap"
+RIG = FIXTURE / "rig.yaml"
+# As words of a command.
+FIX = f"{CAPTURE} --rig {RIG}"
 RECORDINGS = REPOSITORY / ".." / "shared" / "recordings"
 NO_RECORDINGS = "the folder of real recordings is not here"
 NS_PER_S = 10**9
@@ -49,6 +51,10 @@ class Unit:
     first_frame: int = 5
     tail: bytes = b""
     range_mm: int = 4000
+
+    def ahead(self, ns: int) -> Unit:
+        """The lidar with a clock ahead of what it was; packets are received as before."""
+        return replace(self, begin_ns=self.begin_ns + ns, host_ns=self.host_ns - ns)
 
     @property
     def payloads(self) -> list[tuple[int, bytes]]:
@@ -110,49 +116,27 @@ def write_metadata(path: Path, spec: OusterSpec) -> Path:
 
 
 @dataclass(frozen=True, slots=True)
-class Outcome:
-    """Result of a command: exit code and printed text."""
-
-    code: int
-    out: str
-    err: str
-
-    @property
-    def warnings(self) -> list[str]:
-        """Codes of the warnings on stderr."""
-        mark = "mlbatch: warning: "
-        lines = [line for line in self.err.splitlines() if line.startswith(mark)]
-        return [line.removeprefix(mark).split(":")[0] for line in lines]
-
-
-@dataclass(frozen=True, slots=True)
 class Shell:
-    """The command line within this process."""
+    """The command line within this process, in a folder and without syncs."""
 
     monkeypatch: pytest.MonkeyPatch
-    capsys: pytest.CaptureFixture[str]
+    folder: Path
+
+    def __post_init__(self) -> None:
+        self.monkeypatch.chdir(self.folder)
+        self.monkeypatch.setattr(atomic, "sync_to_disk", lambda path: None)
 
     def __call__(self, *arguments: str | Path) -> Outcome:
         """Run `mlbatch ARGUMENTS`; a single text is split into words, as a shell does."""
         alone = arguments[0] if len(arguments) == 1 else ""
-        words = shlex.split(alone) if isinstance(alone, str) and alone else map(str, arguments)
-        self.monkeypatch.setattr(sys, "argv", ["mlbatch", *words])
-        self.monkeypatch.setattr(app, "command_line", parser)
-        self.capsys.readouterr()
-        with pytest.raises(SystemExit) as end:
-            main()
-        printed = self.capsys.readouterr()
-        code = end.value.code
-        return Outcome(code if isinstance(code, int) else 0, printed.out, printed.err)
+        return command(*(shlex.split(alone) if isinstance(alone, str) and alone else arguments))
 
-
-def recording_shell(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], folder: Path
-) -> Shell:
-    """The command line, in a folder, without syncs."""
-    monkeypatch.chdir(folder)
-    monkeypatch.setattr(atomic, "sync_to_disk", lambda path: None)
-    return Shell(monkeypatch, capsys)
+    def dry(self, words: str) -> Report:
+        """The report of a dry run."""
+        outcome = self(f"convert {words} --dry-run")
+        assert outcome.code == 0, outcome.err
+        report: Report = json.loads(outcome.out)
+        return report
 
 
 def arrays(path: str) -> Arrays:

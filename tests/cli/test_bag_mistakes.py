@@ -122,11 +122,8 @@ def _write_wrong_files(folder: Path) -> None:
 
 
 @pytest.fixture
-def shell(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], place: Path
-) -> Shell:
-    monkeypatch.chdir(place)
-    return Shell(monkeypatch, capsys)
+def shell(monkeypatch: pytest.MonkeyPatch, place: Path) -> Shell:
+    return Shell(monkeypatch, place)
 
 
 @pytest.mark.parametrize("name", BAG_MISTAKES)

@@ -15,11 +15,8 @@ from pathlib import Path
 import pytest
 
 import mlbatch
-from tests.builders.sessions import FIXTURE, REPOSITORY, Report, Shell, names, report_of
+from tests.builders.sessions import CAPTURE, FIX, REPOSITORY, RIG, Report, Shell, names, report_of
 
-CAPTURE = FIXTURE / "two_lidars.pcap"
-RIG = FIXTURE / "rig.yaml"
-FIX = f"{CAPTURE} --rig {RIG}"
 # Points of a window: fixtures/two_lidars/SOURCE.md.
 POINTS = 27998
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -10,25 +9,16 @@ from mcap.reader import make_reader
 
 from tests.builders.bags import Body, Recorded
 from tests.builders.mcaps import write_mcap
-from tests.builders.sessions import (
-    NO_RECORDINGS,
-    NS_PER_MS,
-    NS_PER_S,
-    RECORDINGS,
-    Shell,
-    Unit,
-)
+from tests.builders.sessions import NO_RECORDINGS, NS_PER_MS, NS_PER_S, RECORDINGS, Shell, Unit
 from tests.builders.sessions_of_bags import unit_messages
 
 TAI_S = 37
 needs_recordings = pytest.mark.skipif(not RECORDINGS.is_dir(), reason=NO_RECORDINGS)
 
 
-def _ahead(seconds: float, unit: Unit | None = None) -> Unit:
+def _ahead(seconds: float) -> Unit:
     """A lidar whose clock is ahead of the capture host's, and whose packets take 1 ms."""
-    unit = unit or Unit(turns=6)
-    ahead_ns = round(seconds * NS_PER_S)
-    return replace(unit, begin_ns=unit.begin_ns + ahead_ns, host_ns=unit.host_ns - ahead_ns)
+    return Unit(turns=6).ahead(round(seconds * NS_PER_S))
 
 
 @needs_recordings

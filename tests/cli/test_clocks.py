@@ -6,23 +6,12 @@ import json
 import re
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 
 from mlbatch.arrays import I64Array
-from tests.builders.sessions import FIXTURE, NS_PER_S, Shell, Unit, twin, write_session
-
-Report = dict[str, Any]
-RECORDING = f"{FIXTURE / 'two_lidars.pcap'} --rig {FIXTURE / 'rig.yaml'}"
-
-
-def _dry(shell: Shell, arguments: str) -> Report:
-    outcome = shell(f"convert {arguments} --dry-run")
-    assert outcome.code == 0, outcome.err
-    report: Report = json.loads(outcome.out)
-    return report
+from tests.builders.sessions import FIX, NS_PER_S, Report, Shell, Unit, twin, write_session
 
 
 def _codes(report: Report) -> list[str]:
@@ -30,7 +19,7 @@ def _codes(report: Report) -> list[str]:
 
 
 def test_synchronised_clocks_need_no_warning(shell: Shell) -> None:
-    report = _dry(shell, RECORDING)
+    report = shell.dry(FIX)
     assert _codes(report) == []
     for sensor in report["sensors"]:
         assert sensor["clock"]["epoch"] == "utc"
@@ -61,7 +50,7 @@ def test_one_clock_has_one_offset(shell: Shell, tmp_path: Path) -> None:
         assert "4.125" not in text, name
     (stream,) = json.loads(shell("inspect drive.pcap --json").out)["streams"]
     assert stream["offset_ms"] == pytest.approx(BEHIND_MS, abs=1e-3)
-    tai = replace(one, begin_ns=one.begin_ns + 37 * NS_PER_S, host_ns=-37 * NS_PER_S)
+    tai = replace(one, host_ns=0).ahead(37 * NS_PER_S)
     write_session(tmp_path, one, twin(tai, 222))
     said = shell("convert drive.pcap --dry-run --identity-extrinsics").err
     # This one without the millisecond of the network.
@@ -70,19 +59,19 @@ def test_one_clock_has_one_offset(shell: Shell, tmp_path: Path) -> None:
 
 def test_the_offset_of_receive_times_is_none(shell: Shell, tmp_path: Path) -> None:
     write_session(tmp_path, Unit(turns=12))
-    (sensor,) = _dry(shell, "drive.pcap --clock host")["sensors"]
+    (sensor,) = shell.dry("drive.pcap --clock host")["sensors"]
     assert sensor["clock"]["offset_to_host_ms"] == 0
 
 
 def test_drift_is_told(shell: Shell, tmp_path: Path) -> None:
     write_session(tmp_path, Unit(turns=100))
-    report = _dry(shell, "drive.pcap --fault drift:*:40ppm")
+    report = shell.dry("drive.pcap --fault drift:*:40ppm")
     (sensor,) = report["sensors"]
     assert sensor["clock"]["drift_ppm"] == pytest.approx(40, abs=3)
 
 
 def test_clocks_apart_are_reported_with_the_remedy(shell: Shell) -> None:
-    report = _dry(shell, f"{RECORDING} --fault jump:right:0.3s@0s")
+    report = shell.dry(f"{FIX} --fault jump:right:0.3s@0s")
     # On its own clock `left` ends 0.3 s before `right`: the last scans lack it.
     assert _codes(report) == ["loss", "clocks"]
     warning = report["warnings"][1]
@@ -95,7 +84,7 @@ def test_clocks_apart_are_reported_with_the_remedy(shell: Shell) -> None:
 
 def test_an_epoch_in_the_rig_makes_them_comparable(shell: Shell, tmp_path: Path) -> None:
     one = Unit()
-    tai = twin(replace(one, begin_ns=one.begin_ns + 37 * NS_PER_S, host_ns=-37 * NS_PER_S), 222)
+    tai = twin(one.ahead(37 * NS_PER_S), 222)
     write_session(tmp_path, one, tai)
     assert shell("convert drive.pcap --dry-run --identity-extrinsics").code == 1
     here = "extrinsics: {translation_m: [0, 0, 0]}"
@@ -105,7 +94,7 @@ def test_an_epoch_in_the_rig_makes_them_comparable(shell: Shell, tmp_path: Path)
         f'- {{name: right, stream: {{serial: "222"}}, metadata: 222.json, {here}, '
         "clock: {epoch: tai}}\n"
     )
-    report = _dry(shell, "drive.pcap --rig rig.yaml")
+    report = shell.dry("drive.pcap --rig rig.yaml")
     assert report["timescale"] == "utc"
     assert [sensor["columns"]["written"] for sensor in report["sensors"]] == [1024, 1024]
 

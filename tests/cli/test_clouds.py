@@ -28,8 +28,8 @@ from tests.builders.points import (
     custom_message,
 )
 from tests.builders.rosbag2 import write_rosbag2
-from tests.builders.run import scan_files
-from tests.builders.sessions import Outcome, Shell, report_of
+from tests.builders.run import Outcome, scan_files
+from tests.builders.sessions import Shell, report_of
 from tests.builders.transcripts import transcripts
 
 MS = 1_000_000
@@ -647,16 +647,3 @@ def test_a_topic_without_times_is_an_error_unless_ignored(shell: Shell, tmp_path
     # Inspection goes on, and says so.
     text = shell("inspect drive.db3").out
     assert "/map/points: expected the time of each point" in text
-
-
-def test_jobs_agree(shell: Shell, tmp_path: Path) -> None:
-    options = "--identity-extrinsics --jobs 3"
-    assert _run(shell, _two_frames(), options).code == 0
-    found = [dict(np.load(path)) for path in scan_files(tmp_path / "out")]
-    assert _run(shell, _two_frames(), "--identity-extrinsics --jobs 1").code == 0
-    for one, path in zip(found, scan_files(tmp_path / "out"), strict=True):
-        with np.load(path) as other:
-            # A cloud has no known fill.
-            assert {key: one[key].tobytes() for key in one} == {
-                key: other[key].tobytes() for key in other.files
-            }

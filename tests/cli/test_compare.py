@@ -10,9 +10,17 @@ from pathlib import Path
 
 import pytest
 
-from tests.builders.sessions import FIXTURE, NS_PER_MS, REPOSITORY, Shell, Unit, twin, write_session
+from tests.builders.sessions import (
+    CAPTURE,
+    FIXTURE,
+    NS_PER_MS,
+    REPOSITORY,
+    Shell,
+    Unit,
+    twin,
+    write_session,
+)
 
-CAPTURE = FIXTURE / "two_lidars.pcap"
 MAKERS = REPOSITORY / "fixtures" / "four_makers"
 
 

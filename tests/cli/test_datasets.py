@@ -22,7 +22,8 @@ import mlbatch
 from mlbatch.rig.recipes import FACTS, FOLDER, MARKS, UNKNOWN, recipe, recipe_names
 from mlbatch.rig.yaml_tree import read_yaml
 from tests.builders import datasets as made
-from tests.builders.sessions import REPOSITORY, Outcome, Shell
+from tests.builders.run import Outcome
+from tests.builders.sessions import REPOSITORY, Shell, report_of
 from tests.builders.time_readings import SWEEP_NS, drive, scenario
 
 PAGE = (REPOSITORY / "docs" / "datasets.md").read_text(encoding="utf-8")
@@ -126,14 +127,6 @@ REFUSED = {
 }
 
 
-@pytest.fixture
-def shell(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
-) -> Shell:
-    monkeypatch.chdir(tmp_path)
-    return Shell(monkeypatch, capsys)
-
-
 # -- facts, and the page --------------------------------------------------------------------------
 
 
@@ -229,7 +222,7 @@ def test_datasets_that_are_converted(shell: Shell, name: str) -> None:
     if "--dataset" in command:
         assert "dataset" in outcome.warnings
         assert f"{recipe(name).title}: recipe {recipe(name).mark}" in outcome.err
-    sensors = _report()["sensors"]
+    sensors = report_of("scans.mcap.report.json")["sensors"]
     assert [sensor["name"] for sensor in sensors] == list(row.places)
     points = _points(len(sensors))
     for number, sensor in enumerate(sensors):
@@ -273,11 +266,6 @@ def test_points_are_at_the_times_they_were_measured(shell: Shell, name: str) -> 
         # Rounding may put the first column into the window before the first.
         assert expected - found[lidar] <= {0}, lidar
         assert found[lidar] <= expected, lidar
-
-
-def _report(output: str = "scans.mcap") -> dict[str, Any]:
-    found: dict[str, Any] = json.loads(Path(f"{output}.report.json").read_text())
-    return found
 
 
 def _points(lidars: int) -> list[Any]:
@@ -350,7 +338,9 @@ def test_a_rig_and_a_batch_of_a_dataset(shell: Shell) -> None:
     assert shell("digest a.mcap").out.split()[0] == shell("digest b.mcap").out.split()[0]
     assert shell("digest c.mcap").out.split()[0] == shell("digest b.mcap").out.split()[0]
     assert shell("batch eee_0*/*.bag --dataset ntu_viral -o out").code == 0
-    (note,) = [one for one in _report("b.mcap")["warnings"] if one["code"] == "dataset"]
+    (note,) = [
+        one for one in report_of("b.mcap.report.json")["warnings"] if one["code"] == "dataset"
+    ]
     horizontal = Path("eee_01/lidar_horz.yaml").absolute()
     assert note["message"].endswith(f"; poses of {horizontal}, {horizontal.parent}/lidar_vert.yaml")
     again = shell("batch eee_0*/*.bag --dataset ntu_viral -o out")

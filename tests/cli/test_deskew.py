@@ -10,11 +10,18 @@ import numpy as np
 import pytest
 
 import mlbatch
-from tests.builders.sessions import FIXTURE, REPOSITORY, Arrays, Shell, arrays, names, report_of
+from tests.builders.sessions import (
+    CAPTURE,
+    REPOSITORY,
+    RIG,
+    Arrays,
+    Shell,
+    arrays,
+    names,
+    report_of,
+)
 from tests.builders.simulated import scenario_text
 
-CAPTURE = FIXTURE / "two_lidars.pcap"
-RIG = FIXTURE / "rig.yaml"
 WORDS = f"convert {CAPTURE} --rig {RIG} -q"
 FOUR = REPOSITORY / "fixtures" / "four_makers"
 MIXED = f"convert {FOUR / 'four_makers.pcap'} --rig {FOUR / 'rig.yaml'} -q"

@@ -2,22 +2,16 @@
 
 from __future__ import annotations
 
-import json
 from typing import Any
 
-from tests.builders.sessions import FIXTURE, Shell
+from tests.builders.sessions import FIX, Report, Shell
 
-Report = dict[str, Any]
-RECORDING = f"{FIXTURE / 'two_lidars.pcap'} --rig {FIXTURE / 'rig.yaml'}"
 IMU = 85
 
 
 def _report(shell: Shell, *faults: str, more: str = "") -> Report:
     options = " ".join(f"--fault {fault}" for fault in faults)
-    outcome = shell(f"convert {RECORDING} --dry-run {options} {more}")
-    assert outcome.code == 0, outcome.err
-    report: Report = json.loads(outcome.out)
-    return report
+    return shell.dry(f"{FIX} {options} {more}")
 
 
 def _packets(report: Report) -> list[dict[str, Any]]:

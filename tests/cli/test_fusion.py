@@ -14,10 +14,8 @@ import mlbatch
 from mlbatch.comparison.compare import compare
 from mlbatch.pipeline.job import Job
 from tests.builders.phases import CASES, write_case
-from tests.builders.sessions import FIXTURE, Shell, arrays, names, report_of
+from tests.builders.sessions import CAPTURE, RIG, Shell, arrays, names, report_of
 
-CAPTURE = FIXTURE / "two_lidars.pcap"
-RIG = FIXTURE / "rig.yaml"
 WORDS = f"convert {CAPTURE} --rig {RIG} -q"
 POLICIES = {
     "latest": "latest sweeps",
@@ -130,13 +128,6 @@ def test_reused_columns_are_counted(shell: Shell) -> None:
     assert right["columns"]["reused"] > 0
     assert right["columns"]["reused"] % 512 == 0
     assert shell("verify out").code == 0
-
-
-def test_bytes_do_not_depend_on_jobs(shell: Shell) -> None:
-    words = f"{WORDS} --batching latest --batching-times own"
-    assert shell(f"{words} -o one.mcap --jobs 1").code == 0
-    assert shell(f"{words} -o two.mcap --jobs 3").code == 0
-    assert Path("one.mcap").read_bytes() == Path("two.mcap").read_bytes()
 
 
 # -- stamps ---------------------------------------------------------------------------------------

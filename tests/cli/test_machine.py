@@ -16,10 +16,8 @@ import pytest
 
 import mlbatch
 from mlbatch.errors import RecordingError
-from tests.builders.sessions import FIXTURE, Shell
+from tests.builders.sessions import CAPTURE, RIG, Shell
 
-CAPTURE = FIXTURE / "two_lidars.pcap"
-RIG = FIXTURE / "rig.yaml"
 PAIR = f"{CAPTURE} -r {RIG}"
 
 

@@ -21,7 +21,6 @@ from tests.builders.sessions import (
     Records,
     Shell,
     Unit,
-    recording_shell,
     twin,
     write_metadata,
     write_session,
@@ -133,20 +132,14 @@ def write_timed_sessions(folder: Path) -> None:
         after = replace(before, begin_ns=begin_ns, host_ns=host_ns, first_frame=11)
         write_session(folder / name, before, after)
     six = Unit(turns=6)
-    write_session(folder / "tai", _ahead(six, 37_000))
+    write_session(folder / "tai", six.ahead(37 * NS_PER_S))
     # 540.793 s ahead of the capture host, and two lidars 5.25 s behind it.
-    write_session(folder / "ahead", _ahead(six, 540_793))
-    both = _ahead(six, -5_250)
+    write_session(folder / "ahead", six.ahead(540_793 * NS_PER_MS))
+    both = six.ahead(-5_250 * NS_PER_MS)
     write_session(folder / "behind", both, twin(both, 222))
     ptp = replace(SMALL, timestamp_mode="TIME_FROM_PTP_1588")
     for name, spec in (("counted", SMALL), ("ptp", ptp)):
-        write_session(folder / name, _ahead(Unit(spec), -(EPOCH_NS // NS_PER_MS - 866_000)))
-
-
-def _ahead(unit: Unit, ms: int) -> Unit:
-    """The lidar with a clock ahead of the capture host's."""
-    step_ns = ms * NS_PER_MS
-    return replace(unit, begin_ns=unit.begin_ns + step_ns, host_ns=unit.host_ns - step_ns)
+        write_session(folder / name, Unit(spec).ahead(866 * NS_PER_S - EPOCH_NS))
 
 
 def write_metadata_sessions(folder: Path) -> None:
@@ -171,7 +164,7 @@ def write_metadata_sessions(folder: Path) -> None:
     write_session(folder / "posed", replace(six, spec=replace(SMALL, extrinsic_m=pose)))
     for name, mode in (("unnamed", ""), ("internal", "TIME_FROM_INTERNAL_OSC")):
         spec = replace(SMALL, timestamp_mode=mode)
-        since = _ahead(replace(six, spec=spec), -(EPOCH_NS // NS_PER_MS - 866_000))
+        since = replace(six, spec=spec).ahead(866 * NS_PER_S - EPOCH_NS)
         write_session(folder / name, since)
 
 
@@ -188,11 +181,8 @@ def _write_other_modes(folder: Path) -> None:
 
 
 @pytest.fixture
-def shell(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], place: Path
-) -> Shell:
-    monkeypatch.chdir(place)
-    return Shell(monkeypatch, capsys)
+def shell(monkeypatch: pytest.MonkeyPatch, place: Path) -> Shell:
+    return Shell(monkeypatch, place)
 
 
 @pytest.mark.parametrize("name", MISTAKES)
@@ -201,24 +191,16 @@ def test_mistake(shell: Shell, place: Path, name: str) -> None:
 
 
 @pytest.mark.parametrize("name", SESSIONS)
-def test_session(
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-    place: Path,
-    tmp_path: Path,
-    name: str,
-) -> None:
+def test_session(monkeypatch: pytest.MonkeyPatch, place: Path, tmp_path: Path, name: str) -> None:
     for path in place.iterdir():
         (tmp_path / path.name).symlink_to(path)
-    SESSIONS[name].check(recording_shell(monkeypatch, capsys, tmp_path), tmp_path)
+    SESSIONS[name].check(Shell(monkeypatch, tmp_path), tmp_path)
 
 
 @pytest.mark.parametrize("name", OPTIONS)
-def test_options(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path, name: str
-) -> None:
+def test_options(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, name: str) -> None:
     (tmp_path / "fix").symlink_to(FIXTURE)
-    OPTIONS[name].check(recording_shell(monkeypatch, capsys, tmp_path), tmp_path)
+    OPTIONS[name].check(Shell(monkeypatch, tmp_path), tmp_path)
 
 
 @pytest.mark.skipif(not RECORDINGS.is_dir(), reason=NO_RECORDINGS)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,6 +13,7 @@ from tests.builders.mcaps import write_mcap
 from tests.builders.run import command
 from tests.builders.sessions import (
     EPOCH_NS,
+    FIX,
     FIXTURE,
     NS_PER_MS,
     NS_PER_S,
@@ -30,8 +29,6 @@ from tests.builders.sessions import (
 from tests.builders.sessions_of_bags import unit_messages
 from tests.builders.transcripts import transcripts
 
-CAPTURE = FIXTURE / "two_lidars.pcap"
-FIX = f"{CAPTURE} --rig {FIXTURE / 'rig.yaml'}"
 CASES = transcripts("outputs", FIX="fix/two_lidars.pcap --rig fix/rig.yaml")
 # From fixtures/two_lidars/SOURCE.md.
 T_INIT_NS = 1777881600_100_000_000
@@ -55,19 +52,6 @@ def test_transcript(shell: Shell, place: Path, tmp_path: Path, name: str) -> Non
     CASES[name].check(shell, tmp_path)
 
 
-@pytest.fixture
-def dry(shell: Shell) -> Callable[[str], Report]:
-    """The report of a dry run, from stdout."""
-
-    def run(arguments: str) -> Report:
-        outcome = shell(f"convert {arguments} --dry-run")
-        assert outcome.code == 0, outcome.err
-        report: Report = json.loads(outcome.out)
-        return report
-
-    return run
-
-
 def _ledger_balances(report: Report) -> None:
     """Every datagram is in a sensor's packets, its IMU packets or unassigned."""
     capture = report["capture"]
@@ -84,23 +68,21 @@ def _ledger_balances(report: Report) -> None:
         assert points["slots"] == sum(points.values()) - points["slots"]
 
 
-def test_an_end_stops_the_reading(dry: Callable[[str], Report], tmp_path: Path) -> None:
+def test_an_end_stops_the_reading(shell: Shell, tmp_path: Path) -> None:
     """Of 90 s in two files the end is in the first, whose buffer has some 30 s."""
     first = Unit(turns=450)
     second = replace(first, begin_ns=first.begin_ns + 45 * NS_PER_S, first_frame=455)
     one, two = write_session(tmp_path / "1", first), write_session(tmp_path / "2", second)
-    report = dry(f"{one} {two} --end +0.2")
+    report = shell.dry(f"{one} {two} --end +0.2")
     assert report["scans"]["written"] == 2
     assert 0 < report["capture"]["frames"] < 450 * 32
     _ledger_balances(report)
 
 
-def test_an_end_balances_with_recordings_side_by_side(
-    dry: Callable[[str], Report], tmp_path: Path
-) -> None:
+def test_an_end_balances_with_recordings_side_by_side(shell: Shell, tmp_path: Path) -> None:
     one = write_session(tmp_path / "1", Unit(turns=300))
     two = write_session(tmp_path / "2", twin(Unit(turns=450), 222))
-    report = dry(f"{one} {two} --end +0.2 --identity-extrinsics")
+    report = shell.dry(f"{one} {two} --end +0.2 --identity-extrinsics")
     assert report["scans"]["written"] == 2
     _ledger_balances(report)
 
@@ -172,24 +154,22 @@ def test_split_writes_a_folder_a_sensor(shell: Shell) -> None:
         assert (int(part["index"]), bool(part["complete"])) == (4, True)
 
 
-def test_checksums_are_checked_on_wish(dry: Callable[[str], Report], tmp_path: Path) -> None:
+def test_checksums_are_checked_on_wish(shell: Shell, tmp_path: Path) -> None:
     capture = write_session(tmp_path, Unit())
     raw = bytearray(capture.read_bytes())
     raw[24 + 40 * 1338 + 600] ^= 4  # one bit of a pixel in packet 40
     capture.write_bytes(raw)
-    assert dry(str(capture))["sensors"][0]["packets"]["rejected"] == {}
-    packets = dry(f"{capture} --decode crc=check")["sensors"][0]["packets"]
+    assert shell.dry(str(capture))["sensors"][0]["packets"]["rejected"] == {}
+    packets = shell.dry(f"{capture} --decode crc=check")["sensors"][0]["packets"]
     assert packets["rejected"] == {"bad_crc": 1}
     assert packets["lost"] == 1
 
 
-def test_host_clock_makes_uptime_clocks_comparable(
-    dry: Callable[[str], Report], tmp_path: Path
-) -> None:
+def test_host_clock_makes_uptime_clocks_comparable(shell: Shell, tmp_path: Path) -> None:
     one = Unit(begin_ns=50 * NS_PER_S, host_ns=EPOCH_NS)
     two = twin(replace(one, begin_ns=7000 * NS_PER_S, host_ns=EPOCH_NS - 6950 * NS_PER_S), 222)
     capture = write_session(tmp_path, one, two)
-    report = dry(f"{capture} --identity-extrinsics --clock host")
+    report = shell.dry(f"{capture} --identity-extrinsics --clock host")
     assert report["timescale"] == "utc"
     assert [sensor["clock"]["source"] for sensor in report["sensors"]] == ["host", "host"]
     assert report["scans"]["written"] == 2

@@ -14,10 +14,8 @@ import pytest
 
 from mlbatch.cli import progress
 from mlbatch.cli.progress import Lines, Reporter, duration
-from tests.builders.sessions import FIXTURE, REPOSITORY, Shell
+from tests.builders.sessions import CAPTURE, REPOSITORY, RIG, Shell
 
-CAPTURE = FIXTURE / "two_lidars.pcap"
-RIG = FIXTURE / "rig.yaml"
 MB = 10**6
 
 

@@ -6,9 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.builders.sessions import FIXTURE, Shell, arrays, names, report_of
-
-CAPTURE = FIXTURE / "two_lidars.pcap"
+from tests.builders.sessions import CAPTURE, FIXTURE, Shell, arrays, names, report_of
 
 
 @pytest.fixture

@@ -21,15 +21,8 @@ from mlbatch.writers import npz_encoder as npz
 from mlbatch.writers.formats import webdataset
 from mlbatch.writers.output_file import Bytes
 from tests.builders.captures import write_pcap
-from tests.builders.run import command
-from tests.builders.sessions import (
-    FIXTURE,
-    Outcome,
-    Shell,
-    Unit,
-    recording_shell,
-    write_metadata,
-)
+from tests.builders.run import Outcome, command
+from tests.builders.sessions import FIXTURE, Shell, Unit, write_metadata
 from tests.builders.transcripts import transcripts
 from tests.resume_storm import contents, write_recordings
 
@@ -39,12 +32,10 @@ BAG = "--format rosbag2 --max-bag-duration"
 
 
 @pytest.fixture
-def shell(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
-) -> Shell:
+def shell(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Shell:
     """The command line, in a folder with the fixture."""
     (tmp_path / "fix").symlink_to(FIXTURE)
-    return recording_shell(monkeypatch, capsys, tmp_path)
+    return Shell(monkeypatch, tmp_path)
 
 
 def _shards(shell: Shell, words: str, count: int, *, mixed: bool = False) -> list[str]:

@@ -9,10 +9,8 @@ import pytest
 
 import mlbatch
 from mlbatch.errors import UsageError
-from tests.builders.sessions import FIXTURE, REPOSITORY, Shell, arrays, names, report_of
+from tests.builders.sessions import CAPTURE, REPOSITORY, RIG, Shell, arrays, names, report_of
 
-CAPTURE = FIXTURE / "two_lidars.pcap"
-RIG = FIXTURE / "rig.yaml"
 WORDS = f"convert {CAPTURE} --rig {RIG} -q"
 # Four vendors; columns last up to 55 us, so that points step back between lidars.
 FOUR = REPOSITORY / "fixtures" / "four_makers"

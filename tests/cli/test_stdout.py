@@ -11,10 +11,7 @@ import typer.main
 
 from mlbatch.cli.app import COMMANDS, PRINTABLE, command_line
 from mlbatch.rig.rig import read_rig
-from tests.builders.sessions import FIXTURE, NS_PER_S, Shell, Unit, report_of, write_session
-
-CAPTURE = FIXTURE / "two_lidars.pcap"
-RIG = FIXTURE / "rig.yaml"
+from tests.builders.sessions import CAPTURE, NS_PER_S, RIG, Shell, Unit, report_of, write_session
 
 
 def _paths() -> list[tuple[str, str, bool]]:

@@ -8,9 +8,8 @@ from pathlib import Path
 import pytest
 
 from mlbatch.cli import tables
-from tests.builders.sessions import FIXTURE, REPOSITORY, Shell, Unit, twin, write_session
+from tests.builders.sessions import CAPTURE, FIXTURE, REPOSITORY, Shell, Unit, twin, write_session
 
-CAPTURE = FIXTURE / "two_lidars.pcap"
 MAKERS = REPOSITORY / "fixtures" / "four_makers"
 ESCAPE = re.compile(r"\x1b\[[\d;]*m")
 HEAD = ("name", "first long head", "second long head", "number")

@@ -13,7 +13,7 @@ from mlbatch.discovery.match import describe, release
 from mlbatch.readers import open_recording
 from mlbatch.types import StreamTable
 from tests.builders.captures import udp_frame, write_pcap
-from tests.builders.run import Told, command
+from tests.builders.run import Outcome, command
 from tests.builders.sessions import SMALL, Unit, write_session
 from tests.matrix.lidars import NS_PER_MS, NS_PER_S, VENDORS, Sent, Spell, write_metadata
 
@@ -50,7 +50,7 @@ def captured(vendor: str, sent: Sent, path: Path) -> Path:
     return write_pcap(path, frames)
 
 
-def told(vendor: str, folder: Path, verb: str, *captures: Path, words: str = "") -> Told:
+def told(vendor: str, folder: Path, verb: str, *captures: Path, words: str = "") -> Outcome:
     """What a command says of captures of a lidar."""
     write_metadata(folder)
     files: list[str | Path] = ["--metadata", folder / FILES[vendor]] if FILES[vendor] else []

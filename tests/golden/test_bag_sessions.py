@@ -18,13 +18,9 @@ from mlbatch.rig.rig import read_rig
 from tests.builders.mcaps import write_mcap
 from tests.builders.rosbag1 import write_rosbag1
 from tests.builders.rosbag2 import Form, write_folder, write_rosbag2
-from tests.builders.run import TWO_LIDARS, Told, command, load, scan_files
+from tests.builders.run import TWO_LIDARS, Outcome, command, load, scan_files
 from tests.builders.sessions import NS_PER_MS, NS_PER_S, SMALL, Unit, twin
-from tests.builders.sessions_of_bags import (
-    session_of,
-    split_at,
-    unit_messages,
-)
+from tests.builders.sessions_of_bags import session_of, split_at, unit_messages
 from tests.builders.two_lidars import LEFT, RIGHT, body_from_sensor
 
 Write = Callable[[Path], Path]
@@ -46,7 +42,7 @@ SESSIONS: dict[str, Write] = {
 class Made:
     """An output in a folder of npz files."""
 
-    told: Told
+    told: Outcome
     folder: Path
 
     @property

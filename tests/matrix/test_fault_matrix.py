@@ -22,13 +22,8 @@ import pytest
 
 from mlbatch.arrays import I64Array
 from mlbatch.verification import verify
-from tests.builders.run import (
-    Told,
-    command,
-    csv_without_arrival,
-    load,
-    scan_files,
-)
+from tests.builders.run import Outcome as Printed
+from tests.builders.run import command, csv_without_arrival, load, scan_files
 from tests.matrix.cells import KINDS, Kind, Session, plain
 from tests.matrix.containers import CONTAINERS, rig_text, span_ns
 from tests.matrix.lidars import NS_PER_MS, NS_PER_S, VENDORS, Sent, write_metadata
@@ -88,7 +83,7 @@ class Cell:
         text = rig_text(session, self.container, clocks)
         (self.folder / "rig.yaml").write_text(text, encoding="utf-8")
 
-    def convert(self, *words: str, faulty: bool = True, output: str = "out") -> Told:
+    def convert(self, *words: str, faulty: bool = True, output: str = "out") -> Printed:
         """Run the command."""
         (recording,) = self.folder.glob("drive.*")
         rig = self.folder / "rig.yaml"

@@ -11,7 +11,8 @@ from hypothesis import strategies as st
 
 from mlbatch.arrays import F64Array, I64Array
 from mlbatch.errors import RecordingError
-from mlbatch.motion.imu import Integrator, integrated
+from mlbatch.motion.imu import Integrator, standstill
+from mlbatch.motion.track import PoseTrack
 from mlbatch.units import STANDARD_GRAVITY
 
 HZ = 100
@@ -26,6 +27,16 @@ def samples(seconds: float) -> Samples:
     count = round(seconds * HZ) + 1
     stamps: I64Array = START + np.arange(count) * (S // HZ)
     return stamps, np.tile(UP, (count, 1)), np.zeros((count, 3))
+
+
+def integrated(
+    stamps: I64Array, force: F64Array, rate: F64Array, pose: F64Array, name: str = "imu"
+) -> PoseTrack:
+    """All samples at once; RecordingError if they are shorter than the standstill."""
+    track = Integrator(pose, name).push(stamps, force, rate)
+    if not len(track.stamp_ns):
+        standstill(stamps, force, rate, name)
+    return track
 
 
 def test_at_rest_the_body_stays_whatever_bias_and_tilt() -> None:

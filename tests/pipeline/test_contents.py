@@ -16,10 +16,9 @@ from tests.builders.bags import Body, Recorded, fixture_messages
 from tests.builders.mcaps import write_mcap
 from tests.builders.rosbag1 import write_rosbag1
 from tests.builders.rosbag2 import write_rosbag2
-from tests.builders.sessions import EPOCH_NS, FIXTURE, NS_PER_MS, NS_PER_S, Shell, Unit
+from tests.builders.sessions import CAPTURE, EPOCH_NS, FIXTURE, NS_PER_MS, NS_PER_S, Shell, Unit
 from tests.builders.sessions_of_bags import unit_messages
 
-CAPTURE = FIXTURE / "two_lidars.pcap"
 EVERY_NS = 50 * NS_PER_MS
 
 

@@ -17,7 +17,7 @@ from mlbatch.rig.rig import read_rig
 from mlbatch.simulate.velodyne.encode import VelodyneSpec
 from tests.builders.captures import udp_frame
 from tests.builders.sessions import (
-    FIXTURE,
+    CAPTURE,
     NO_RECORDINGS,
     NS_PER_MS,
     NS_PER_S,
@@ -32,7 +32,6 @@ from tests.builders.sessions import (
 )
 from tests.builders.vendor_sessions import framed, lidar_payloads, write_capture
 
-CAPTURE = FIXTURE / "two_lidars.pcap"
 OUSTER = RECORDINGS / "ouster"
 needs_recordings = pytest.mark.skipif(not RECORDINGS.is_dir(), reason=NO_RECORDINGS)
 LEFT = "ouster_122647000123"

@@ -31,7 +31,7 @@ from mlbatch.writers import npz_encoder as npz
 from mlbatch.writers.formats import webdataset
 from mlbatch.writers.output_file import Bytes
 from tests.builders.run import command
-from tests.builders.sessions import FIXTURE, SMALL, Shell, Unit, recording_shell, write_session
+from tests.builders.sessions import FIXTURE, SMALL, Shell, Unit, write_session
 from tests.builders.transcripts import transcripts
 from tests.resume_storm import contents, write_recordings
 
@@ -41,14 +41,6 @@ CASES = transcripts("resume", FIX=FIX)
 # From fixtures/two_lidars/SOURCE.md: a window of 10 Hz each.
 SCANS = 7
 JOURNAL = Path("out.partial/files.jsonl")
-
-
-@pytest.fixture
-def shell(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
-) -> Shell:
-    """The command line, in an empty folder."""
-    return recording_shell(monkeypatch, capsys, tmp_path)
 
 
 def _fail_at(monkeypatch: pytest.MonkeyPatch, scan: int, error: BaseException) -> None:

@@ -15,10 +15,9 @@ import pytest
 import mlbatch
 from mlbatch.errors import RecordingError, UsageError
 from mlbatch.python.recording import Recording
-from tests.contract.tree import ROOT
+from tests.builders.sessions import FIXTURE
 from tests.outputs.test_read import FORMATS
 
-FIXTURE = ROOT / "fixtures" / "two_lidars"
 OPTIONS: dict[str, dict[str, Any]] = {
     "plain": {},
     "split": {"split": True, "slices": 3},

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from pathlib import Path
 from typing import Any
 
@@ -13,11 +14,9 @@ import yaml
 import mlbatch
 from mlbatch.errors import MlbatchError, UsageError
 from mlbatch.python.recording import Recording
-from tests.contract.tree import ROOT, run_python
+from tests.builders.sessions import CAPTURE, FIXTURE
+from tests.contract.tree import run_python
 from tests.python.test_dataset import assert_equal
-
-FIXTURE = ROOT / "fixtures" / "two_lidars"
-CAPTURE = FIXTURE / "two_lidars.pcap"
 
 
 @pytest.fixture(scope="module")
@@ -96,8 +95,9 @@ def test_pages_by_functions_with_the_names_of_packages(tmp_path: Path) -> None:
     found = mlbatch.compare(CAPTURE, FIXTURE / "rig.yaml", html=tmp_path / "c.html")
     assert found.rate_hz == "10"
     assert (tmp_path / "c.html").exists()
-    with pytest.raises(UsageError, match="tolerance: expected"):
-        mlbatch.compare(CAPTURE, tolerance=0)
+    for wrong in (0, -1, math.inf, math.nan):
+        with pytest.raises(UsageError, match="tolerance: expected"):
+            mlbatch.compare(CAPTURE, tolerance=wrong)
 
 
 def test_paths_are_checked_at_the_call(tmp_path: Path) -> None:

@@ -10,11 +10,7 @@ import pytest
 import mlbatch
 from mlbatch.errors import ExportError, NoScanError, UsageError
 from mlbatch.pipeline import preflight
-from tests.contract.tree import ROOT
-
-FIXTURE = ROOT / "fixtures" / "two_lidars"
-CAPTURE = FIXTURE / "two_lidars.pcap"
-RIG = FIXTURE / "rig.yaml"
+from tests.builders.sessions import CAPTURE, RIG
 
 
 def test_the_report_of_a_run(tmp_path: Path) -> None:
@@ -39,12 +35,6 @@ def test_a_dry_run_writes_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     assert list(tmp_path.iterdir()) == []
     run = mlbatch.convert(CAPTURE, None, rig=RIG, report="report.json")
     assert [path.name for path in tmp_path.iterdir()] == ["report.json"]
-
-
-def test_jobs_do_not_change_the_output(tmp_path: Path) -> None:
-    for jobs in (1, 3):
-        mlbatch.convert(CAPTURE, tmp_path / f"{jobs}.mcap", rig=RIG, jobs=jobs)
-    assert (tmp_path / "1.mcap").read_bytes() == (tmp_path / "3.mcap").read_bytes()
 
 
 def test_an_existing_output_is_kept(tmp_path: Path) -> None:

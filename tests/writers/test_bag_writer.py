@@ -21,7 +21,7 @@ from mlbatch.writers import FilesWriter, ScanWriter, WriterOptions, open_writer
 from mlbatch.writers.base import windows_per_file
 from tests.builders.files import Noted
 from tests.builders.scans import PERIOD_NS, START_NS, SUMMARY, dense_scan, imu_samples, run_job
-from tests.builders.sessions import FIXTURE, Shell, recording_shell
+from tests.builders.sessions import FIXTURE, Shell
 from tests.builders.written_bags import ROS2_NOTE, note
 from tests.resume_storm import write_recordings
 
@@ -30,14 +30,6 @@ BAG = "bag/drive.mcap --identity-extrinsics --pass /chatter"
 TURNS = 8
 # Topic, log time, message.
 Sent = tuple[str, int, bytes]
-
-
-@pytest.fixture
-def shell(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
-) -> Shell:
-    """The command line, in an empty folder."""
-    return recording_shell(monkeypatch, capsys, tmp_path)
 
 
 def _messages(path: Path) -> list[Sent]:
