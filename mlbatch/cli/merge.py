@@ -5,9 +5,11 @@ from __future__ import annotations
 import shlex
 import sys
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
+
+from mlbatch.cli.parameters import shared, with_parameters
 
 
 def merge(
@@ -17,20 +19,7 @@ def merge(
     output: Annotated[
         Path, typer.Option("-o", "--output", help="Folder of all scans, as of one run.")
     ],
-    fail_on: Annotated[
-        list[str] | None,
-        typer.Option(
-            help="Exit with 3 beyond limits, as loss>0.1%,underfilled>0; repeatable.",
-            metavar="LIMITS",
-        ),
-    ] = None,
-    overwrite: Annotated[
-        bool, typer.Option("--overwrite", help="Replace an existing output.")
-    ] = False,
-    no_fsync: Annotated[
-        bool, typer.Option("--no-fsync", help="Do not wait until the output is on the disk.")
-    ] = False,
-    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No summary.")] = False,
+    **values: Any,
 ) -> None:
     """Join the shards of a conversion to the output of one run."""
     from mlbatch.cli.summary import exit_beyond, print_summary, say
@@ -40,15 +29,22 @@ def merge(
     from mlbatch.pipeline.merge import read_parts
     from mlbatch.reports.limits import exceeded, parse_limits
 
-    limits = parse_limits(fail_on or ())
+    limits = parse_limits(values["fail_on"] or ())
     command = shlex.join(["mlbatch", *sys.argv[1:]])
     with interruptible():
         report = merge_parts(
-            read_parts(parts), output, command=command, overwrite=overwrite, fsync=not no_fsync
+            read_parts(parts),
+            output,
+            command=command,
+            overwrite=values["overwrite"],
+            fsync=not values["no_fsync"],
         )
     for item in report.warnings:
         say(f"warning: {item.code}: {item.message}")
-    if not quiet:
+    if not values["quiet"]:
         print_summary(report)
         typer.echo(one_line(f"wrote {output}, {len(parts)} shards merged"))
     exit_beyond(exceeded(limits, report))
+
+
+with_parameters(merge, shared("fail_on", "overwrite", "no_fsync", "quiet", quiet="No summary."))

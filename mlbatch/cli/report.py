@@ -5,9 +5,11 @@ from __future__ import annotations
 import sys
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
+
+from mlbatch.cli.parameters import is_stdout, shared, with_parameters
 
 
 def report(
@@ -30,20 +32,10 @@ def report(
         Path | None,
         typer.Option(help="Report of the run (JSON). [default: in OUTPUT or next to it]"),
     ] = None,
-    html_scans: Annotated[
-        str | None,
-        typer.Option(
-            help="Scans on the page, with all their points. [default: as many as 3 MB hold]",
-            metavar="N|all",
-        ),
-    ] = None,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an existing page.")] = (
-        False
-    ),
+    **values: Any,
 ) -> None:
     """Write a page (HTML) of a run: verdict, timeline, fill, clocks, accounts, scans."""
     from mlbatch.bounded import MOST_BYTES
-    from mlbatch.cli.parameters import is_stdout
     from mlbatch.errors import UsageError, one_line
     from mlbatch.page import check_page, find_source, shown_scans, source_of_text, write_page
     from mlbatch.page.document import page_text
@@ -63,11 +55,14 @@ def report(
         found = source_of_text(Path("standard input"), text)
     else:
         found = find_source(source, report)
-    found = replace(found, scans=shown_scans(html_scans))
+    found = replace(found, scans=shown_scans(values["html_scans"]))
     page = output or found.page
     if is_stdout(output):
         typer.echo(page_text(found), nl=False)
         return
-    check_page(page, overwrite=overwrite)
+    check_page(page, overwrite=values["overwrite"])
     write_page(page, found)
     typer.echo(one_line(f"wrote {page}"))
+
+
+with_parameters(report, shared("html_scans", "overwrite", overwrite="Replace an existing page."))
