@@ -129,19 +129,8 @@ def test_text_is_folded_between_words(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_clocks_of_many_sensors_are_a_matrix(shell: Shell, tmp_path: Path) -> None:
     """Three lidars, each 3 ms ahead of the one before: six differences, worked out by hand."""
     first = Unit(turns=20)
-    ms = 10**6
-    units = [
-        first,
-        *(
-            twin(
-                Unit(turns=20, begin_ns=first.begin_ns + n * 3 * ms, host_ns=ms - n * 3 * ms),
-                111 * (n + 1),
-                f"10.0.0.{n + 1}",
-            )
-            for n in (1, 2)
-        ),
-    ]
-    capture = write_session(tmp_path, *units)
+    ahead = (twin(first.ahead(n * 3 * 10**6), 111 * (n + 1), f"10.0.0.{n + 1}") for n in (1, 2))
+    capture = write_session(tmp_path, first, *ahead)
     outcome = shell(f"inspect {capture}")
     assert outcome.code == 0
     text = outcome.out[outcome.out.index("clock minus clock") :]
