@@ -227,12 +227,13 @@ def inside(folder: str) -> list[RemoteFile]:
     folder = folder.rstrip("/")
     if folder.partition("://")[0] in _WEB:
         return []
-    place = _place(f"{folder}/")
-    import obstore
 
-    prefix = place.path.rstrip("/") or None
-    found = _repeated(folder, lambda: obstore.list_with_delimiter(place.store, prefix=prefix))
-    return sorted(_remote_file(place.root, meta) for meta in found["objects"])
+    def objects(obstore: Any, place: _Place) -> list[RemoteFile]:
+        prefix = place.path.rstrip("/") or None
+        found = obstore.list_with_delimiter(place.store, prefix=prefix)
+        return [_remote_file(place.root, meta) for meta in found["objects"]]
+
+    return sorted(_request(f"{folder}/", objects))
 
 
 def matching(pattern: str) -> list[str]:
