@@ -35,4 +35,5 @@ def datasets(
         rows.append([one, *facts[2:6], "refused" if facts.refused else facts.mark])
     for line in table_lines(rows):
         typer.echo(line)
+    typer.echo("not verified: no page that was read states it; look for it before you use the data")
     typer.echo("mlbatch convert RECORDING --dataset NAME -o scans.mcap")

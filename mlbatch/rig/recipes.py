@@ -57,7 +57,11 @@ class Dataset(NamedTuple):
         return "; not verified: ".join([self.mark, *filter(None, [", ".join(self.not_verified)])])
 
 
-_REQUIRED = tuple(name for name in Dataset._fields if name not in Dataset._field_defaults)
+# Facts in words: those without a page are not verified.
+_IN_WORDS = ("lidars", "size", "licence")
+_REQUIRED = tuple(
+    name for name in Dataset._fields if name not in (*Dataset._field_defaults, *_IN_WORDS)
+)
 _LISTS = ("not_verified", "signs")
 
 
@@ -72,7 +76,11 @@ def dataset_of(node: Node) -> Dataset:
     }
     others = {name: _text(fields[name]) for name in fields if name not in (*_LISTS, "pages")}
     urls = {fact: _urls(value) for fact, value in pages.items()}
-    return Dataset(**{**others, **lists, "pages": urls})  # type: ignore[arg-type]
+    for fact in _IN_WORDS:
+        if (fact in fields) != bool(urls[fact]):
+            has = "its page in pages" if fact in fields else f"the fact of its page, {fact}"
+            raise fields.get(fact, node).error(has, UNKNOWN, "give both, or leave both out")
+    return Dataset(**{**dict.fromkeys(_IN_WORDS, UNKNOWN), **others, **lists, "pages": urls})  # type: ignore[arg-type]
 
 
 def _text(node: Node) -> str:

@@ -19,7 +19,9 @@ import numpy as np
 import pytest
 
 import mlbatch
+from mlbatch.errors import RigError
 from mlbatch.rig.recipes import FACTS, FOLDER, MARKS, UNKNOWN, recipe, recipe_names
+from mlbatch.rig.rig import read_rig
 from mlbatch.rig.yaml_tree import read_yaml
 from tests.builders import datasets as made
 from tests.builders.run import Outcome
@@ -149,6 +151,21 @@ def test_facts_have_pages_or_are_not_verified(name: str) -> None:
     assert facts.refused or facts.mark != "disputed" or facts.not_verified
 
 
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("  licence: MIT\n", "", "the fact of its page, licence"),
+        ("    size: https", "    size: not verified #", "its page in pages, found not verified"),
+    ],
+)
+def test_a_fact_needs_its_page(old: str, new: str, message: str, tmp_path: Path) -> None:
+    text = (FOLDER / "tiers.yaml").read_text(encoding="utf-8")
+    assert old in text
+    (tmp_path / "rig.yaml").write_text(text.replace(old, new, 1), encoding="utf-8")
+    with pytest.raises(RigError, match=message):
+        read_rig(tmp_path / "rig.yaml")
+
+
 def _row(name: str) -> str:
     facts = recipe(name)
     if facts.refused:
@@ -168,7 +185,8 @@ def test_the_tables_of_the_page_are_those_of_the_recipes() -> None:
 
 
 def test_recipes_are_listed(shell: Shell) -> None:
-    *table, use = shell("datasets").out.splitlines()
+    *table, legend, use = shell("datasets").out.splitlines()
+    assert legend.startswith("not verified: no page that was read states it")
     assert use == "mlbatch convert RECORDING --dataset NAME -o scans.mcap"
     assert [line.split()[0] for line in table] == ["name", *recipe_names()]
     assert "631 GB  " in table[1 + recipe_names().index("tiers")]
