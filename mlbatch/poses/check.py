@@ -8,7 +8,7 @@ stays without any single place.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from itertools import combinations
 from typing import NamedTuple
 
@@ -175,14 +175,14 @@ class PoseComparison:
     @property
     def is_settled(self) -> bool:
         """Whether more places would add nothing."""
-        if self.places < _CLEAR_PLACES:
-            return False
         if self.places >= _MOST_PLACES:
             return True
+        if self.places < _CLEAR_PLACES:
+            return False
         pairs = self._measured()
         if all(pair.surfaces <= _STRAY * self.places for pair in pairs):
             return True
-        return self._are_clear(pairs)
+        return self._are_clear(pairs) and (not _is_any_wrong(pairs) or self._stays_wrong())
 
     def add(self, place: Place) -> None:
         """Compare the clouds of a place: a cloud of each lidar in a window, then in the next."""
@@ -224,7 +224,8 @@ class PoseComparison:
             self._places[-1] = self._used(place)
             self._match()
         self._needs_all |= across < _FEW_SURFACES
-        self.needs_more = not self._are_clear(self._measured())
+        pairs = self._measured()
+        self.needs_more = _is_any_wrong(pairs) or not self._are_clear(pairs)
 
     def _end_place(self) -> None:
         """Count the surfaces of a place that is complete."""
@@ -305,6 +306,14 @@ class PoseComparison:
         self._rows = problem.rows(self._state, level)
         self._joined = _estimate(self._solved())
 
+    def _stays_wrong(self) -> bool:
+        """Whether poses are proven to be wrong if surfaces are matched anew, too."""
+        before = self._state, self._rows, self._joined
+        self._rematch()
+        found = _is_any_wrong(self._measured())
+        self._state, self._rows, self._joined = before
+        return found
+
     def _with_cause(self, key: tuple[int, int], pair: PairFigures) -> PairFigures:
         """Figures with the mistake that explains them, if one does."""
         if pair.outcome == MEASURED and not pair.undetermined:
@@ -344,30 +353,30 @@ class PoseComparison:
         self, clouds: Place, key: tuple[int, int], poses: Sequence[F64Array]
     ) -> list[Cloud]:
         """Clouds of two lidars as if they had been converted with other poses."""
-        moves = [poses[lidar] @ np.linalg.inv(self._poses[lidar]) for lidar in key]
-        both = [cloud for cloud in clouds if cloud.lidar in key]
-        return [_moved(cloud, key.index(cloud.lidar), moves) for cloud in both]
+        moves = {lidar: poses[lidar] @ np.linalg.inv(self._poses[lidar]) for lidar in key}
+        found = []
+        for cloud in clouds:
+            if cloud.lidar in key:
+                turn, shift_m = moves[cloud.lidar][:3, :3], moves[cloud.lidar][:3, 3]
+                points_m = np.matmul(cloud.points_m, turn.T) + shift_m
+                origin_m = cloud.origin_m
+                if origin_m is not None:
+                    origin_m = np.matmul(turn, origin_m) + shift_m
+                found.append(Cloud(key.index(cloud.lidar), points_m, cloud.time_s, origin_m))
+        return found
 
     def _measured(self) -> tuple[PairFigures, ...]:
         if self._joined is None and self._rows:
             self._joined = _estimate(self._solved())
         return tuple(map(self._figures, self._pairs, self._shared))
 
-    def _are_clear(self, pairs: Sequence[PairFigures]) -> bool:
-        """Whether all pairs are proven to be right or wrong."""
-        return all(map(self._is_clear, pairs)) and not any(
-            pair.undetermined and not pair.is_wrong for pair in pairs
-        )
-
     @staticmethod
-    def _is_clear(pair: PairFigures) -> bool:
-        if not pair.is_known:
-            return False
-        if pair.is_wrong:
-            return True
-        shift_m = ((pair.shift_mm or 0.0) + _PROOF * (pair.shift_deviation_mm or 0.0)) / 1000.0
-        turn_deg = (pair.turn_deg or 0.0) + _PROOF * (pair.turn_deviation_deg or 0.0)
-        return shift_m <= LIMIT_M and np.deg2rad(turn_deg) <= LIMIT_RAD
+    def _are_clear(pairs: Sequence[PairFigures]) -> bool:
+        """Whether each pair is proven to be wrong, or to be right in all directions."""
+        return all(
+            pair.is_wrong or (pair.is_known and pair.is_within(_PROOF) and not pair.undetermined)
+            for pair in pairs
+        )
 
     def _figures(self, key: tuple[int, int], pair: _Shared) -> PairFigures:
         joined = self._joined
@@ -400,14 +409,14 @@ class PoseComparison:
             if len(self._rows) < _LEAST_PLACES:
                 reason = "one place alone does not prove that they are apart"
             return figures._replace(reason=reason)
+        shift_mm, shift_deviation_mm = shift.rounded(1000.0, 1)
+        turn_deg, turn_deviation_deg = turn.rounded(float(np.rad2deg(1.0)), 3)
         return figures._replace(
             outcome=OFF if is_off else MEASURED,
-            shift_mm=None if shift.size is None else round(1000 * shift.size, 1),
-            shift_deviation_mm=None if shift.size is None else round(1000 * shift.sigma, 1),
-            turn_deg=None if turn.size is None else round(float(np.rad2deg(turn.size)), 3),
-            turn_deviation_deg=None
-            if turn.size is None
-            else round(float(np.rad2deg(turn.sigma)), 3),
+            shift_mm=shift_mm,
+            shift_deviation_mm=shift_deviation_mm,
+            turn_deg=turn_deg,
+            turn_deviation_deg=turn_deviation_deg,
             undetermined=(
                 *(f"shift along {axis}" for axis in shift.undetermined),
                 *(f"turn about {axis}" for axis in turn.undetermined),
@@ -422,7 +431,7 @@ class PoseComparison:
         """Shift or turn of the second lidar of a pair, at its place."""
         to_part = self._matrix(key, turn=turn)
         value = np.matmul(to_part, joined.value)
-        covariance = _projected(to_part, joined.covariance)
+        covariance = np.matmul(np.matmul(to_part, joined.covariance), to_part.T)
         most, limit = (_MOST_SIGMA_RAD, LIMIT_RAD) if turn else (_MOST_SIGMA_M, LIMIT_M)
         floor = _FLOOR_RAD if turn else _FLOOR_M
         variance, axes = np.linalg.eigh(covariance)
@@ -482,7 +491,7 @@ class PoseComparison:
             and figures.shift_mm is not None
             and figures.turn_deg is not None
             and figures.fit_percent >= 100 * _FITS
-            and self._is_clear(figures)
+            and figures.is_within(_PROOF)
             and not (is_whole and figures.undetermined)
         )
 
@@ -495,17 +504,17 @@ class _Part:
     sigma: float = 0.0
     is_beyond: bool = False
     is_proven: bool = False
-    undetermined: tuple[str, ...] = field(default=())
+    undetermined: tuple[str, ...] = ()
+
+    def rounded(self, unit: float, digits: int) -> tuple[float | None, float | None]:
+        """Length and standard deviation in a unit; None without a direction."""
+        if self.size is None:
+            return None, None
+        return round(unit * self.size, digits), round(unit * self.sigma, digits)
 
 
-def _moved(cloud: Cloud, lidar: int, moves: Sequence[F64Array]) -> Cloud:
-    """A cloud with another number and pose of its lidar; moves: (4, 4), by the new number."""
-    move = moves[lidar]
-    points_m = np.matmul(cloud.points_m, move[:3, :3].T) + move[:3, 3]
-    origin_m = cloud.origin_m
-    if origin_m is not None:
-        origin_m = np.matmul(move[:3, :3], origin_m) + move[:3, 3]
-    return Cloud(lidar, points_m, cloud.time_s, origin_m)
+def _is_any_wrong(pairs: Sequence[PairFigures]) -> bool:
+    return any(pair.is_wrong for pair in pairs)
 
 
 def _across(rows: Rows) -> int:
@@ -523,11 +532,6 @@ def _estimate(solution: Solution) -> _Estimate:
     covariance = solution.covariance * scale[:, None] * scale
     covariance = (covariance + covariance.T) / 2
     return _Estimate(value, covariance, solution.weak.shape[1])
-
-
-def _projected(matrix: F64Array, covariance: F64Array) -> F64Array:
-    found: F64Array = np.matmul(np.matmul(matrix, covariance), matrix.T)
-    return found
 
 
 def _seems_off(estimate: _Estimate) -> bool:

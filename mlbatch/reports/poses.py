@@ -14,6 +14,8 @@ NOT_CHECKED = "not checked"
 # A wrong pose: a residual above these is a warning.
 LIMIT_MM = 30.0
 LIMIT_DEG = 0.3
+# Standard deviations that words add to a figure.
+_SHOWN = 2.0
 # Mistakes that explain a wrong pose.
 EXCHANGED = "exchanged"
 RADIANS = "radians"
@@ -72,7 +74,7 @@ class PairFigures(NamedTuple):
             )
         if self.outcome == OFF:
             found = f"double walls: {self.lidars[-1]} is {self._found()} off"
-        elif not self.is_within:
+        elif not self.is_within(_SHOWN):
             found = f"they are not proven to be apart: {self._found(with_sigma=True)}"
         else:
             found = f"they agree within {_bounds([self])}"
@@ -88,12 +90,16 @@ class PairFigures(NamedTuple):
             return "; with rotation_rpy_deg as radians they fit: write degrees"
         return ""
 
-    @property
-    def is_within(self) -> bool:
-        """Whether the figures and two standard deviations are within the limits."""
-        shift_mm = (self.shift_mm or 0.0) + 2 * (self.shift_deviation_mm or 0.0)
-        turn_deg = (self.turn_deg or 0.0) + 2 * (self.turn_deviation_deg or 0.0)
-        return shift_mm <= LIMIT_MM and turn_deg <= LIMIT_DEG
+    def bounds(self, deviations: float) -> tuple[float | None, float | None]:
+        """Shift, mm, and turn, degrees, plus so many standard deviations; None: not known."""
+        shift_mm = self.shift_mm and self.shift_mm + deviations * (self.shift_deviation_mm or 0.0)
+        turn_deg = self.turn_deg and self.turn_deg + deviations * (self.turn_deviation_deg or 0.0)
+        return shift_mm, turn_deg
+
+    def is_within(self, deviations: float) -> bool:
+        """Whether the figures and so many standard deviations are within the limits."""
+        shift_mm, turn_deg = self.bounds(deviations)
+        return (shift_mm or 0.0) <= LIMIT_MM and (turn_deg or 0.0) <= LIMIT_DEG
 
     def _found(self, *, with_sigma: bool = False) -> str:
         parts = []
@@ -108,18 +114,11 @@ class PairFigures(NamedTuple):
 
 def _bounds(pairs: Sequence[PairFigures]) -> str:
     """Two standard deviations above the largest figures of pairs."""
-    shifts_mm = [
-        pair.shift_mm + 2 * (pair.shift_deviation_mm or 0.0)
-        for pair in pairs
-        if pair.shift_mm is not None
-    ]
-    turns_deg = [
-        pair.turn_deg + 2 * (pair.turn_deviation_deg or 0.0)
-        for pair in pairs
-        if pair.turn_deg is not None
-    ]
-    parts = [f"{max(shifts_mm):.0f} mm"] if shifts_mm else []
-    parts += [f"{max(turns_deg):.2f} degrees"] if turns_deg else []
+    shifts_mm, turns_deg = zip(*(pair.bounds(_SHOWN) for pair in pairs), strict=True)
+    shift_mm = max((one for one in shifts_mm if one is not None), default=None)
+    turn_deg = max((one for one in turns_deg if one is not None), default=None)
+    parts = [] if shift_mm is None else [f"{shift_mm:.0f} mm"]
+    parts += [] if turn_deg is None else [f"{turn_deg:.2f} degrees"]
     return ", ".join(parts)
 
 
@@ -153,7 +152,7 @@ class PoseFigures(NamedTuple):
         if any(pair.is_wrong for pair in known):
             return "poses are wrong"
         text = f"surfaces agree within {_bounds(known)}"
-        if not all(pair.is_within for pair in known):
+        if not all(pair.is_within(_SHOWN) for pair in known):
             text = "poses: neither proven to be right nor wrong"
         elif any(pair.undetermined for pair in known):
             text += " in the directions that the scene determines"
