@@ -101,9 +101,8 @@ class Comparison:
 
     def figures(self) -> list[PolicyFigures]:
         """Figures of each policy, for pages and plots; starts after the first set of all."""
-        series = [one.series for one in self.reports if one.series is not None]
-        begin_s = min((float(one.start_s.min()) for one in series if one.sets), default=0.0)
-        return [replace(one, start_s=one.start_s - begin_s) for one in series]
+        begin_s = min((float(one.start_s.min()) for one in self.reports if one.sets), default=0.0)
+        return [replace(one, start_s=one.start_s - begin_s) for one in self.reports]
 
     def as_json(self) -> dict[str, Value]:
         """The JSON document."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from array import array
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass
 
 import numpy as np
 
@@ -50,37 +50,24 @@ class Distribution:
         return cls(float(values_ms.min()), p50, p99, float(values_ms.max()))
 
 
-@dataclass(frozen=True, slots=True)
-class SetReport:
-    """Figures of the sets of one join policy, or of windows."""
+@dataclass(frozen=True, slots=True, eq=False)
+class SetReport(PolicyFigures):
+    """Figures of the sets of one join policy, or of windows; starts in s of the common clock.
 
-    policy: str
-    sets: int
-    # Sets in which a sensor has no sweep.
-    without_a_sensor: int
-    # Sets with a stale sweep.
-    stale: int
-    # From the first column of a set to its last.
-    span_ms: Distribution
-    # Between the midpoints of the sensors' sweeps in a set.
-    apart_ms: Distribution
-    # Columns that the sets could use.
-    columns: int
-    # Columns in more than one set.
-    used_twice: int
-    # Columns in no set.
-    never_used: int
-    # From the first column of a set until the set is complete.
-    latency_ms: Distribution = Distribution()
-    # Of every set, in the order of publication; starts in s of the common clock.
-    series: PolicyFigures | None = field(default=None, compare=False, repr=False)
+    span: from the first column of a set to its last; apart: between the midpoints of the sensors'
+    sweeps in a set, of sets with several; latency: from the first column of a set until the set is
+    complete.
+    """
+
+    span: Distribution = Distribution()
+    apart: Distribution = Distribution()
+    latency: Distribution = Distribution()
 
     def row(self) -> list[str]:
         """Cells of the table, as HEAD."""
-        span = self.span_ms
-        apart = self.apart_ms
+        span, apart = self.span, self.apart
         return [
-            self.policy,
+            self.name,
             str(self.sets),
             str(self.without_a_sensor),
             str(self.stale),
@@ -92,9 +79,18 @@ class SetReport:
 
     def as_json(self) -> dict[str, str | int | dict[str, float | None]]:
         """The policy in the JSON document."""
-        document = asdict(replace(self, series=None))
-        del document["series"]
-        return document
+        return {
+            "policy": self.name,
+            "sets": self.sets,
+            "without_a_sensor": self.without_a_sensor,
+            "stale": self.stale,
+            "span_ms": asdict(self.span),
+            "apart_ms": asdict(self.apart),
+            "columns": self.columns,
+            "used_twice": self.used_twice,
+            "never_used": self.never_used,
+            "latency_ms": asdict(self.latency),
+        }
 
 
 class SetStatistics:
@@ -146,29 +142,20 @@ class SetStatistics:
         """The figures; columns: of all sweeps; waiting: sweeps that later sets might use."""
         undecided = sum(sweep.columns for sweep in waiting if sweep is not self._last[sweep.sensor])
         return SetReport(
-            policy=self._policy,
+            name=self._policy,
             sets=self._sets,
             without_a_sensor=self._without,
             stale=self._stale,
-            span_ms=Distribution.of(self._spans_ns),
-            apart_ms=Distribution.of(self._aparts_ns),
             columns=columns - undecided,
             used_twice=self._used_twice,
             never_used=columns - undecided - self._used,
-            latency_ms=Distribution.of(self._latencies_ns),
-            series=PolicyFigures(
-                name=self._policy,
-                sets=self._sets,
-                without_a_sensor=self._without,
-                stale=self._stale,
-                columns=columns - undecided,
-                used_twice=self._used_twice,
-                never_used=columns - undecided - self._used,
-                start_s=np.array(self._firsts_ns, np.int64) / NS_PER_S,
-                span_ms=np.array(self._spans_ns, np.int64) / NS_PER_MS,
-                apart_ms=np.array(self._all_aparts_ns, np.int64) / NS_PER_MS,
-                latency_ms=np.array(self._latencies_ns, np.int64) / NS_PER_MS,
-            ),
+            start_s=np.array(self._firsts_ns, np.int64) / NS_PER_S,
+            span_ms=np.array(self._spans_ns, np.int64) / NS_PER_MS,
+            apart_ms=np.array(self._all_aparts_ns, np.int64) / NS_PER_MS,
+            latency_ms=np.array(self._latencies_ns, np.int64) / NS_PER_MS,
+            span=Distribution.of(self._spans_ns),
+            apart=Distribution.of(self._aparts_ns),
+            latency=Distribution.of(self._latencies_ns),
         )
 
     def _use(self, sweep: Sweep) -> None:

@@ -202,7 +202,8 @@ class _Stalls:
     def findings(self) -> Iterator[Finding]:
         """A finding for each of the first intervals, and one for the others."""
         windows = self.windows
-        tail = f" All {number(self.lost, 'lost packet')} of {self.sensor} are of this time."
+        times = "this time" if len(self.intervals) == 1 else "its stalls"
+        loss = f" All {number(self.lost, 'lost packet')} of {self.sensor} are of {times}."
         for first, end in self.intervals[:_MOST_STALLS]:
             begin_s = windows.seconds(first)
             end_s = windows.seconds(end - 1) + _length_s(windows, end - 1)
@@ -218,8 +219,8 @@ class _Stalls:
                     f"{what} from +{begin_s:.1f} s to +{end_s:.1f} s: a stall of "
                     f"{number(end - first, 'scan')}."
                 )
-            if self.has_all_loss and len(self.intervals) == 1:
-                text += tail
+            if self.has_all_loss and (first, end) == self.intervals[0]:
+                text += loss
             yield Finding(Level.PROBLEM, text, _POWER)
         if len(self.intervals) > _MOST_STALLS:
             more = len(self.intervals) - _MOST_STALLS

@@ -35,12 +35,12 @@ def test_sets_are_those_of_compare(shell: Shell, policy: str, case: str) -> None
     capture = write_case(Path("case"), CASES[case])
     words = f"convert {capture} --identity-extrinsics -q --report report.json"
     assert shell(f"{words} --batching {policy} -o sets").code == 0
-    own = next(one for one in compare(Job((capture,))).reports if one.policy == POLICIES[policy])
+    own = next(one for one in compare(Job((capture,))).reports if one.name == POLICIES[policy])
     found = [arrays(f"sets/{name}") for name in names("sets")]
     assert len(found) == own.sets
     spans_ms = [np.ptp(one["column_stamp_ns"]) / 1e6 for one in found]
-    assert max(spans_ms) == pytest.approx(own.span_ms.max)
-    assert min(spans_ms) == pytest.approx(own.span_ms.min)
+    assert max(spans_ms) == pytest.approx(own.span.max)
+    assert min(spans_ms) == pytest.approx(own.span.min)
     used: list[tuple[int, int]] = []
     for one in found:
         used += zip(one["column_lidar_id"].tolist(), one["column_stamp_ns"].tolist(), strict=True)

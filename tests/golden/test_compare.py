@@ -33,12 +33,12 @@ def found(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Comparison]:
 
 
 def _policy(found: dict[str, Comparison], case: str, policy: str) -> SetReport:
-    return next(one for one in found[case].reports if one.policy == policy)
+    return next(one for one in found[case].reports if one.name == policy)
 
 
 def _spans_ms(report: SetReport) -> tuple[float, float]:
-    low = report.span_ms.min
-    high = report.span_ms.max
+    low = report.span.min
+    high = report.span.max
     assert low is not None
     assert high is not None
     return low, high
@@ -73,7 +73,7 @@ def test_phases_add_to_the_span(
     for policy, more_ms in zip(POLICIES, spans_ms, strict=False):
         report = _policy(found, case, policy)
         assert _spans_ms(report) == pytest.approx((SWEEP_MS + more_ms,) * 2, abs=1e-9)
-        assert (report.apart_ms.min, report.apart_ms.max) == (more_ms, more_ms)
+        assert (report.apart.min, report.apart.max) == (more_ms, more_ms)
         assert (report.without_a_sensor, report.stale, report.used_twice) == (0, 0, 0)
         # 99 sweeps: the first has no known begin, the last no end; and some have no partner.
         assert 96 <= report.sets <= 97

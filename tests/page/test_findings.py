@@ -72,24 +72,41 @@ def test_a_silent_sensor_is_named_with_its_time(silent: range, text: str) -> Non
 
 
 @pytest.mark.parametrize(
-    ("elsewhere", "expected"),
+    ("right", "lost", "expected"),
     [
-        (0, ["right sent nothing from +0.3 s to +0.6 s: a stall of 3 scans. All 100 lost packets"]),
+        (
+            [30, 30, 25, 0, 0, 0, 25, 30, 30, 30],
+            100,
+            ["right sent nothing from +0.3 s to +0.6 s: a stall of 3 scans. All 100 lost packets"],
+        ),
+        (
+            [30, 0, 30, 30, 30, 0, 0, 30, 30, 30],
+            90,
+            [
+                "right sent nothing from +0.1 s to +0.2 s: a stall of 1 scan. All 90 lost packets "
+                "of right are of its stalls.",
+                "right sent nothing from +0.5 s to +0.7 s: a stall of 2 scans.",
+            ],
+        ),
         # 20 more in another scan.
-        (20, ["right sent nothing from +0.3 s", "right lost 120 packets of 1,000, 12.0 %."]),
+        (
+            [30, 30, 25, 0, 0, 0, 25, 10, 30, 30],
+            120,
+            ["right sent nothing from +0.3 s", "right lost 120 packets of 1,000, 12.0 %."],
+        ),
     ],
 )
-def test_the_loss_of_a_stall_is_one_finding(elsewhere: int, expected: list[str]) -> None:
-    """3 windows of 30 columns, and 5 columns of the windows before and after; packets of one."""
-    lost = 100 + elsewhere
+def test_the_loss_of_a_stall_is_one_finding(
+    right: list[int], lost: int, expected: list[str]
+) -> None:
+    """Windows of 30 columns, packets of one."""
     document = report(sensor("left"), sensor("right", 1, lost=lost))
     document["sensors"][1]["columns"]["decoded"] = 1000 - lost
-    document["scans"]["incomplete"] = 3
-    right = [30, 30, 25, 0, 0, 0, 25, 30 - elsewhere, 30, 30]
-    columns = [[30, count] for count in right]
-    missing = [[0, 30 - count] for count in right]
-    windows = read_windows(table(("left", "right"), columns, missing), 1)
-    texts = [one.text for one in findings(RunReport.from_json(document), windows)]
+    document["scans"]["incomplete"] = right.count(0)
+    csv = table(
+        *(("left", "right"), [[30, count] for count in right], [[0, 30 - count] for count in right])
+    )
+    texts = [one.text for one in findings(RunReport.from_json(document), read_windows(csv, 1))]
     assert len(texts) == len(expected)
     assert all(text.startswith(words) for text, words in zip(texts, expected, strict=True))
 

@@ -120,21 +120,6 @@ def test_scans_of_a_page_are_chosen(words: str, count: int, shell: Shell) -> Non
     assert about in Path("page.html").read_text(encoding="utf-8")
 
 
-@pytest.mark.parametrize("words", ["0", "-1", "many", "1.5", "\u0662"])
-def test_numbers_of_scans_are_checked(words: str, shell: Shell) -> None:
-    outcome = shell(f"convert {FIX} -o scans --html page.html --html-scans={words}")
-    assert outcome.code == 2
-    assert "--html-scans: expected a number of scans from 1 on or all" in outcome.err
-    assert not Path("scans").exists()
-
-
-def test_scans_without_a_page_are_refused(shell: Shell) -> None:
-    outcome = shell(f"convert {FIX} -o scans --html-scans 3")
-    assert outcome.code == 2
-    assert "--html-scans: expected a page for the scans, found none; add --html" in outcome.err
-    assert not Path("scans").exists()
-
-
 def test_large_scans_are_thinned_by_whole_columns(
     shell: Shell, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -352,45 +337,45 @@ def test_a_page_is_replaced_only_with_overwrite_and_nothing_else_ever(shell: She
     assert Path("thesis.html").read_text(encoding="utf-8").endswith("mine")
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ("nothing.json", "expected a report or an output, found no such file or folder"),
-        ("other.json", "expected a report of schema mlbatch.report/1, found 'none'"),
-        ("damaged.json", "expected a report in JSON, found"),
-        ("empty", "expected a report in or next to the output, found none"),
-        ("good.json -o missing/page.html", "expected a page in an existing folder"),
-        ("good.json -o empty", "expected a file for the page, found a folder"),
-        ("empty --report nothing.json", "expected a report, found no such file"),
-    ],
+MISTAKES = (
+    ("report nothing.json", 1, "expected a report or an output, found no such file or folder"),
+    ("report other.json", 1, "expected a report of schema mlbatch.report/1, found 'none'"),
+    ("report damaged.json", 1, "expected a report in JSON, found"),
+    ("report empty", 1, "expected a report in or next to the output, found none"),
+    ("report good.json -o missing/page.html", 1, "expected a page in an existing folder"),
+    ("report good.json -o empty", 1, "expected a file for the page, found a folder"),
+    ("report empty --report nothing.json", 1, "expected a report, found no such file"),
+    # Before the run.
+    ("convert -o scans --html scans/page.html", 1, "expected a page outside the output"),
+    ("convert -o scans --html none/page.html", 1, "expected a page in an existing folder"),
+    *(
+        (f"convert -o s.mcap --html {page} --report run.json", 1, f"expected a page {where}")
+        for page, where in (
+            ("run.json", "apart from the output, its table and report"),
+            ("s.mcap.scans.csv", "apart from the output, its table and report"),
+            ("s.mcap", "outside the output"),
+        )
+    ),
+    ("convert -o scans --html-scans 3", 2, "expected a page for the scans, found none; add --html"),
+    *(
+        (f"convert -o scans --html page.html --html-scans={number}", 2, "a number of scans from 1")
+        for number in ("0", "-1", "many", "1.5", "\u0662")
+    ),
 )
-def test_mistakes_are_one_line(arguments: str, message: str, shell: Shell) -> None:
+
+
+@pytest.mark.parametrize(("words", "code", "message"), MISTAKES)
+def test_mistakes_are_one_line(words: str, code: int, message: str, shell: Shell) -> None:
     Path("other.json").write_text("{}", encoding="utf-8")
     Path("damaged.json").write_text("{", encoding="utf-8")
     Path("good.json").write_text(text(report(sensor("left"))), encoding="utf-8")
     Path("empty").mkdir()
-    outcome = shell(f"report {arguments}")
-    assert outcome.code == 1
+    before = set(Path().rglob("*"))
+    outcome = shell(words.replace("convert", f"convert {FIX}"))
+    assert outcome.code == code
     assert message in outcome.err
     assert outcome.err.count("\n") == 1
-
-
-@pytest.mark.parametrize(
-    ("page", "message"),
-    [
-        ("scans/page.html", "expected a page outside the output"),
-        ("none/page.html", "expected a page in an existing folder"),
-        ("run.json", "expected a page apart from the output, its table and report"),
-        ("s.mcap.scans.csv", "expected a page apart from the output, its table and report"),
-        ("s.mcap", "expected a page outside the output"),
-    ],
-)
-def test_convert_refuses_a_wrong_page_before_it_runs(page: str, message: str, shell: Shell) -> None:
-    output = "scans" if "/" in page else "s.mcap"
-    outcome = shell(f"convert {FIX} -o {output} --html {page} --report run.json")
-    assert outcome.code == 1
-    assert message in outcome.err
-    assert list(Path().iterdir()) == []
+    assert set(Path().rglob("*")) == before
 
 
 def test_segments_have_numbered_pages(shell: Shell) -> None:
