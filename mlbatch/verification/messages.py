@@ -14,7 +14,7 @@ from typing import Protocol
 import numpy as np
 
 from mlbatch.arrays import F64Array
-from mlbatch.outputs.cloud_messages import CLOUD, read_cloud, stored_scan
+from mlbatch.outputs.cloud_messages import CLOUD, PRESETS, read_cloud, stored_scan
 from mlbatch.outputs.containers import Message
 from mlbatch.outputs.damage import CheckLog, DamageError
 from mlbatch.outputs.encoding import MessageCursor
@@ -62,15 +62,26 @@ LIMITS = {
     "duplicates": "messages have no column stamps",
     "names": "one file",
 }
-# Layouts without a field for a check.
-LAYOUT_LIMITS = {
-    "times": ("minimal",),
-    "order": ("minimal",),
-    "geometry": ("standard", "velodyne", "hesai", "kiss-icp", "minimal"),
-    "sensors": ("velodyne", "ouster", "hesai", "autoware", "kiss-icp", "minimal"),
-    "rings": ("autoware", "kiss-icp", "minimal"),
-    "returns": ("velodyne", "ouster", "hesai", "kiss-icp", "minimal"),
+_TIMES = ("time", "t", "timestamp", "time_stamp")
+# Fields of point layouts, one of which a check needs.
+_NEEDED = {
+    "times": _TIMES,
+    "order": _TIMES,
+    "geometry": ("range", "distance"),
+    "sensors": ("lidar_id",),
+    "rings": ("ring",),
+    "returns": ("return_type",),
 }
+
+
+def layout_limits(layout: str) -> dict[str, str]:
+    """Why checks are impossible on clouds of a point layout; "": there is no cloud."""
+    names = set(PRESETS[layout].dtype.names or ()) if layout else set()
+    return {
+        check: f"the point layout {layout} has no field for it"
+        for check, fields in _NEEDED.items()
+        if layout and names.isdisjoint(fields)
+    }
 
 
 @dataclass(frozen=True, slots=True, eq=False)

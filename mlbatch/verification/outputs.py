@@ -17,7 +17,7 @@ from mlbatch.outputs.metadata import RunMetadata, metadata_of_grid
 from mlbatch.outputs.run_files import PIECES, TABLE, RunFiles
 from mlbatch.verification import messages
 from mlbatch.verification.examination import Examination, Progress
-from mlbatch.verification.messages import LAYOUT_LIMITS, TopicChecks
+from mlbatch.verification.messages import TopicChecks, layout_limits
 from mlbatch.verification.report_checks import ReportFiles
 from mlbatch.verification.verdict import Verdict, outcomes
 
@@ -195,11 +195,8 @@ def _format(name: str, topics: TopicChecks) -> str:
 
 def _limits(topics: TopicChecks) -> dict[str, str]:
     """Reasons why checks are not possible on messages of a layout."""
-    own = {
-        check: f"the point layout {topics.layout} has no field for it"
-        for check, layouts in LAYOUT_LIMITS.items()
-        if topics.layout in layouts and not topics.log.checked[check]
-    }
+    limits = layout_limits(topics.layout).items()
+    own = {check: text for check, text in limits if not topics.log.checked[check]}
     if topics.layout == "ouster":
         own["geometry"] = _RANGES
     if topics.strange_frames:

@@ -74,9 +74,13 @@ def text(document: dict[str, Any]) -> str:
 
 
 def table(
-    names: tuple[str, ...], columns: list[list[int]], missing: list[list[int]] | None = None
+    names: tuple[str, ...],
+    columns: list[list[int]],
+    expected: int | None = None,
+    *,
+    has_head: bool = False,
 ) -> str:
-    """scans.csv of windows with these columns of each sensor (a list a window)."""
+    """scans.csv of windows with these columns of each sensor (a list a window), of so many."""
     head = ["index", "slice", "start_ns", "end_ns", "first_stamp_ns", "last_stamp_ns", "points"]
     head += ["columns", *(f"columns_{name}" for name in names), "complete"]
     head += [f"max_gap_ns_{name}" for name in names]
@@ -85,9 +89,9 @@ def table(
     for index, own in enumerate(columns):
         start_ns = START_NS + index * PERIOD_NS
         end_ns = start_ns + PERIOD_NS
-        lacks = [""] * len(own) if missing is None else list(map(str, missing[index]))
+        lacks = ["" if expected is None else str(expected - count) for count in own]
         complete = "true" if all(own) else "false"
-        cells = [index, 0, start_ns, end_ns, start_ns + 100_000, end_ns - 100_000]
+        cells = [index - has_head, 0, start_ns, end_ns, start_ns + 100_000, end_ns - 100_000]
         cells += [10 * sum(own), sum(own), *own]
         row = [*map(str, cells), complete, *("195300" if count else "0" for count in own)]
         row += ["1.000"] * len(own) + ["0.000"] * len(own) + lacks + [str(end_ns + 2_000_000)]

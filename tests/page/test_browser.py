@@ -87,8 +87,7 @@ def test_every_plot_is_drawn(width: int, dark: bool, tab: Browser, real_page: Pa
 
 def test_a_stall_is_red_where_it_was(tab: Browser, tmp_path: Path) -> None:
     columns = [[512, 0 if 30 <= index < 60 else 512] for index in range(100)]
-    missing = [[512 - count for count in own] for own in columns]
-    csv = table(("left", "right"), columns, missing)
+    csv = table(("left", "right"), columns, 512)
     source = Source(
         RunReport.from_json(report(sensor("left"), sensor("right", 1))), csv, None, tmp_path
     )
@@ -104,8 +103,7 @@ def test_a_stall_is_red_where_it_was(tab: Browser, tmp_path: Path) -> None:
 
 def test_the_timeline_can_be_enlarged_down_to_windows(tab: Browser, tmp_path: Path) -> None:
     columns = [[512 - (index == 50), 512 - 40 * (index == 50)] for index in range(100)]
-    missing = [[512 - count for count in own] for own in columns]
-    csv = table(("left", "right"), columns, missing)
+    csv = table(("left", "right"), columns, 512)
     source = Source(
         RunReport.from_json(report(sensor("left"), sensor("right", 1))), csv, None, tmp_path
     )
@@ -256,7 +254,7 @@ def test_an_hour_of_four_lidars_is_small_and_opens_quickly(tab: Browser, tmp_pat
     lost = draw.binomial(32, 0.02, (36_000, 4)) * 16
     columns = (512 - lost).tolist()
     sensors = [sensor(name, i, drift_ppm=i) for i, name in enumerate(names)]
-    csv = table(names, columns, lost.tolist())
+    csv = table(names, columns, 512)
     source = Source(RunReport.from_json(report(*sensors, scans=36_000)), csv, None, tmp_path)
     page = page_of(tmp_path, source)
     # Scans of the output would add 3 MB.

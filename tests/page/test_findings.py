@@ -18,8 +18,7 @@ def found(document: dict[str, Any], columns: list[list[int]] | None = None) -> l
     """Level and text of each finding."""
     windows = None
     if columns is not None:
-        missing = [[512 - count for count in own] for own in columns]
-        windows = read_windows(table(("left", "right"), columns, missing), 1)
+        windows = read_windows(table(("left", "right"), columns, 512), 1)
     return [
         f"{one.level.name}: {one.text}" for one in findings(RunReport.from_json(document), windows)
     ]
@@ -103,9 +102,7 @@ def test_the_loss_of_a_stall_is_one_finding(
     document = report(sensor("left"), sensor("right", 1, lost=lost))
     document["sensors"][1]["columns"]["decoded"] = 1000 - lost
     document["scans"]["incomplete"] = right.count(0)
-    csv = table(
-        *(("left", "right"), [[30, count] for count in right], [[0, 30 - count] for count in right])
-    )
+    csv = table(("left", "right"), [[30, count] for count in right], 30)
     texts = [one.text for one in findings(RunReport.from_json(document), read_windows(csv, 1))]
     assert len(texts) == len(expected)
     assert all(text.startswith(words) for text, words in zip(texts, expected, strict=True))
@@ -115,8 +112,7 @@ def test_head_and_tail_are_partial_by_request() -> None:
     document = report(sensor("left"), sensor("right", 1))
     document["scans"]["incomplete"] = 3
     columns = [[100, 100], [512, 512], [512, 512], [512, 0]]
-    missing = [[512 - count for count in own] for own in columns]
-    text = table(("left", "right"), columns, missing).replace("\n0,0,", "\n-1,0,", 1)
+    text = table(("left", "right"), columns, 512, has_head=True)
     texts = [one.text for one in findings(RunReport.from_json(document), read_windows(text, 1))]
     assert "1 scan of 10 is incomplete: a sensor does not cover the window." in texts
     assert "Head and tail are incomplete, as requested by --keep-partial." in texts
@@ -127,8 +123,7 @@ def test_head_and_tail_alone_are_no_good_run(written: int) -> None:
     document = report(sensor("left"), sensor("right", 1))
     document["scans"] |= {"written": written, "incomplete": written}
     columns = [[100, 100], [50, 0]][:written]
-    missing = [[512 - count for count in own] for own in columns]
-    text = table(("left", "right"), columns, missing).replace("\n0,0,", "\n-1,0,", 1)
+    text = table(("left", "right"), columns, 512, has_head=True)
     found_texts = [
         one.text
         for one in findings(RunReport.from_json(document), read_windows(text, 1))

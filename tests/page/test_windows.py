@@ -12,16 +12,16 @@ from tests.page.runs import PERIOD_NS, START_NS, table
 
 def windows(
     columns: list[list[int]],
-    missing: list[list[int]] | None = None,
+    expected: int | None = None,
     names: tuple[str, ...] = ("left", "right"),
 ) -> Windows:
-    found = read_windows(table(names, columns, missing), 1)
+    found = read_windows(table(names, columns, expected), 1)
     assert found is not None
     return found
 
 
 def test_fill_is_columns_per_expected_column() -> None:
-    found = windows([[512, 256], [384, 0], [512, 512]], [[0, 256], [128, 512], [0, 0]])
+    found = windows([[512, 256], [384, 0], [512, 512]], 512)
     np.testing.assert_array_equal(found.fill, [[1.0, 0.5], [0.75, 0.0], [1.0, 1.0]])
     np.testing.assert_array_equal(found.expected, np.full((3, 2), 512))
     assert not found.estimated.any()
@@ -29,7 +29,7 @@ def test_fill_is_columns_per_expected_column() -> None:
 
 
 def test_a_grid_that_cuts_between_two_columns_is_no_loss() -> None:
-    found = windows([[512, 511], [512, 510]], [[0, 1], [0, 2]])
+    found = windows([[512, 511], [512, 510]], 512)
     np.testing.assert_array_equal(found.fill, [[1.0, 1.0], [1.0, 510 / 512]])
 
 
@@ -55,7 +55,9 @@ def test_the_fill_of_the_table_counts() -> None:
 
     A single column less is the grid between two columns, in the table as well.
     """
-    text = table(("left",), [[256], [512], [511], [510]], [[0], [0], [1], [2]])
+    text = table(("left",), [[256], [512], [511], [510]], 512)
+    ready_ns = START_NS + PERIOD_NS + 2_000_000
+    text = text.replace(f",256,{ready_ns}", f",0,{ready_ns}")
     head, *rows = text.splitlines()
     fills = ("0.5", "", "0.998", "0.996")
     cells = [f"{row},{fill}" for row, fill in zip(rows, fills, strict=True)]
@@ -66,8 +68,7 @@ def test_the_fill_of_the_table_counts() -> None:
 
 def test_the_worst_window_is_neither_head_nor_tail() -> None:
     columns = [[100, 100], [512, 512], [512, 300], [512, 512], [512, 0]]
-    text = table(("left", "right"), columns, [[512 - count for count in own] for own in columns])
-    found = read_windows(text.replace("\n0,0,", "\n-1,0,", 1), 1)
+    found = read_windows(table(("left", "right"), columns, 512, has_head=True), 1)
     assert found is not None
     assert found.has_head
     assert found.worst() == 2
@@ -88,7 +89,7 @@ def test_long_runs_are_summarised_by_their_worst_windows() -> None:
     rows = MOST_CELLS
     columns = [[512, 512]] * rows
     columns[1001] = [512, 128]
-    found = windows(columns, [[512 - count for count in own] for own in columns])
+    found = windows(columns, 512)
     summary = summarise(found)
     assert summary.group == 2
     assert len(summary.count) == rows // 2
