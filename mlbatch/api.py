@@ -51,7 +51,7 @@ from mlbatch.python.options import (
 from mlbatch.python.recording import Recording, scans_of
 from mlbatch.python.run import Run, run_job
 from mlbatch.units import NS_PER_S
-from mlbatch.writers import write_text
+from mlbatch.writers.atomic import write_text
 
 if TYPE_CHECKING:
     # In `typing` from Python 3.11 on.

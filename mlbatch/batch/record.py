@@ -10,7 +10,7 @@ from typing import Any
 from mlbatch.batch.session import STARTED_JSON
 from mlbatch.bounded import parse_json, read_text
 from mlbatch.outputs.run_files import SESSION_JSON
-from mlbatch.writers import write_text
+from mlbatch.writers.atomic import write_text
 
 SCHEMA = "mlbatch.session/1"
 DONE = "done"

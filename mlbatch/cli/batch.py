@@ -158,7 +158,7 @@ def batch(
 
 def _jobs(asked: str | None, workers: int) -> str | None:
     """Jobs of each session; None: as `convert` decides, or its rig."""
-    from mlbatch.writers import parse_jobs
+    from mlbatch.writers.threads import parse_jobs
 
     if asked is None:
         # Several sessions use all cores already.

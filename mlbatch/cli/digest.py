@@ -94,6 +94,6 @@ def _check(path: Path, *, overwrite: bool) -> None:
 
 
 def _write(path: Path, text: str) -> None:
-    from mlbatch.writers import write_text
+    from mlbatch.writers.atomic import write_text
 
     write_text(path, text)

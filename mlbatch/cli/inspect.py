@@ -61,7 +61,7 @@ def inspect(
         return
     if write_rig is not None:
         from mlbatch.errors import ExportError
-        from mlbatch.writers import write_text
+        from mlbatch.writers.atomic import write_text
 
         if write_rig.exists():
             raise ExportError(

@@ -60,7 +60,7 @@ AsJson: TypeAlias = Annotated[bool, typer.Option("--json", help="Print JSON, for
 
 
 def _formats() -> Iterable[str]:
-    from mlbatch.writers import format_names
+    from mlbatch.writers.formats import format_names
 
     return format_names()
 

@@ -29,7 +29,8 @@ from mlbatch.pipeline.interrupts import interruptible
 from mlbatch.pipeline.job import Job, TimeSegment
 from mlbatch.pipeline.output import Output, OutputRequest
 from mlbatch.reports.report import RunReport, report_of, report_text
-from mlbatch.writers import discard, report_paths
+from mlbatch.writers import report_paths
+from mlbatch.writers.atomic import discard
 
 # Loaded where it is needed: a dry run has no files.
 if TYPE_CHECKING:

@@ -32,19 +32,17 @@ from mlbatch.pipeline.job_identity import difference, input_identity, job_identi
 from mlbatch.reports.json_records import from_json, to_json
 from mlbatch.reports.ledger import POINT_COUNTERS
 from mlbatch.types import ImuSamples, Message, Scan
-from mlbatch.writers import (
+from mlbatch.writers import has_several_files, plugin
+from mlbatch.writers.atomic import (
     FILES_JSONL,
-    WriterOptions,
+    SCANS_CSV,
     discard,
     export_errors,
-    has_several_files,
     locked,
     partial_path,
-    plugin,
 )
-from mlbatch.writers.atomic import SCANS_CSV
 from mlbatch.writers.bag_metadata import METADATA
-from mlbatch.writers.base import windows_per_file
+from mlbatch.writers.base import WriterOptions, windows_per_file
 from mlbatch.writers.formats import file_suffixes, windows_of_format
 from mlbatch.writers.output_file import file_crc, write_all
 from mlbatch.writers.scan_folder import name_of_windows, scan_name

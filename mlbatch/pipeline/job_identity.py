@@ -20,7 +20,7 @@ import mlbatch
 from mlbatch.bounded import open_file, parse_json, read_bytes, read_text
 from mlbatch.errors import RecordingError
 from mlbatch.pipeline.job import Job
-from mlbatch.writers import WriterOptions
+from mlbatch.writers.base import WriterOptions
 
 if TYPE_CHECKING:
     from mlbatch.pipeline.conversion import Conversion

@@ -34,11 +34,11 @@ from mlbatch.reports.report import (
     report_text,
 )
 from mlbatch.reports.scan_table import ScanStatistics, merged_table
-from mlbatch.writers import (
+from mlbatch.writers import choose_format
+from mlbatch.writers.atomic import (
     FILES_JSONL,
     REPORT_JSON,
     SCANS_CSV,
-    choose_format,
     discard,
     export_errors,
     prepare,

@@ -16,32 +16,32 @@ from mlbatch.pipeline.run import convert
 from mlbatch.reports.report import RunReport, report_text
 from mlbatch.types import RunInfo
 from mlbatch.writers import (
-    FILES_JSONL,
-    REPORT_JSON,
-    SCANS_CSV,
-    SHARD_JSON,
-    FilesWriter,
-    ScanWriter,
-    WriterOptions,
     check_options,
     check_target,
     check_variants,
     choose_format,
-    discard,
-    export_errors,
     extras,
-    jobs_for,
     one_file_format,
     open_writer,
-    partial_path,
     record_layout,
     report_paths,
+)
+from mlbatch.writers.atomic import (
+    FILES_JSONL,
+    REPORT_JSON,
+    SCANS_CSV,
+    SHARD_JSON,
+    discard,
+    export_errors,
+    partial_path,
     side_path,
     state_path,
-    sync_entries,
     tidy,
     write_text,
 )
+from mlbatch.writers.base import FilesWriter, ScanWriter, WriterOptions
+from mlbatch.writers.durable import sync_entries
+from mlbatch.writers.threads import jobs_for
 
 # Loaded where it is needed: a dry run has no files.
 if TYPE_CHECKING:

@@ -9,7 +9,8 @@ from pathlib import Path
 from mlbatch.errors import ExportError
 from mlbatch.pipeline.job import Job
 from mlbatch.rig.rig import read_rig
-from mlbatch.writers import (
+from mlbatch.writers import report_paths
+from mlbatch.writers.atomic import (
     check_free_space,
     check_name,
     free_bytes,
@@ -17,7 +18,6 @@ from mlbatch.writers import (
     is_taken,
     old_path,
     partial_path,
-    report_paths,
     state_path,
 )
 

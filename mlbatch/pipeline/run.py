@@ -25,7 +25,7 @@ from mlbatch.pipeline.workers import OrderedWorkers, run_inline
 from mlbatch.reports.report import RunReport, fill_totals, imbalances, report_text
 from mlbatch.types import ImuSamples, Message, RunInfo, Summary
 from mlbatch.units import NS_PER_S
-from mlbatch.writers import FilesWriter, ScanJob, ScanWriter
+from mlbatch.writers.base import FilesWriter, ScanJob, ScanWriter
 
 if TYPE_CHECKING:
     from mlbatch.pipeline.files import Files

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from mlbatch.pipeline.conversion import Conversion
 from mlbatch.pipeline.decode_pool import Decoded, DecodeTask, DecodeWorker
 from mlbatch.types import ImuSamples, Message
-from mlbatch.writers import FilesWriter, ScanJob, ScanWriter
+from mlbatch.writers.base import FilesWriter, ScanJob, ScanWriter
 
 if TYPE_CHECKING:
     from mlbatch.pipeline.files import Files, FinishedScan

@@ -24,17 +24,17 @@ from mlbatch.pipeline.job import Shard
 from mlbatch.pipeline.job_identity import identity_of_parts
 from mlbatch.reports.json_records import from_json, to_json
 from mlbatch.reports.report import RunReport
-from mlbatch.writers import (
+from mlbatch.writers import has_several_files
+from mlbatch.writers.atomic import (
     FILES_JSONL,
     SCANS_CSV,
     SHARD_JSON,
-    WriterOptions,
     export_errors,
-    has_several_files,
     partial_path,
     write_text,
 )
 from mlbatch.writers.bag_metadata import METADATA
+from mlbatch.writers.base import WriterOptions
 from mlbatch.writers.formats import built_in_names
 from mlbatch.writers.output_file import file_crc
 

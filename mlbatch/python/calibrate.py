@@ -68,7 +68,7 @@ from mlbatch.rig.rig import Rig, RigSensor, UnknownExtrinsics, read_rig
 from mlbatch.rig.write import write_rig
 from mlbatch.types import Scan
 from mlbatch.units import NS_PER_MS, NS_PER_S
-from mlbatch.writers import check_name
+from mlbatch.writers.atomic import check_name
 
 # Windows in which a machine moves evenly, Hz.
 _RATE = 10

@@ -17,8 +17,7 @@ from mlbatch.outputs.read import IndexedScans, open_scans
 from mlbatch.outputs.run_files import SESSION_JSON, is_output
 from mlbatch.outputs.scan import Scan
 from mlbatch.outputs.table import Rows
-from mlbatch.writers import SHARD_JSON
-from mlbatch.writers.atomic import PARTIAL_SUFFIX
+from mlbatch.writers.atomic import PARTIAL_SUFFIX, SHARD_JSON
 
 # Of files that may be outputs: reports and tables are next to them.
 _SUFFIXES = (".mcap", ".bag", PARTIAL_SUFFIX)

@@ -36,7 +36,7 @@ from mlbatch.readers.inputs import expand
 from mlbatch.rig.convert_keys import POSE_MODELS
 from mlbatch.sensors.options import check_options
 from mlbatch.units import parse_rate
-from mlbatch.writers import parse_jobs
+from mlbatch.writers.threads import parse_jobs
 
 AnyPath: TypeAlias = "str | PathLike[str]"
 # One path or several: a text is one, never an iterable of its letters.

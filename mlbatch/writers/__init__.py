@@ -7,36 +7,8 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from mlbatch.errors import UsageError
 from mlbatch.options import PLY_STYLES
-from mlbatch.writers.atomic import (
-    FILES_JSONL,
-    REPORT_JSON,
-    SCANS_CSV,
-    SHARD_JSON,
-    check_free_space,
-    check_name,
-    discard,
-    export_errors,
-    free_bytes,
-    is_report,
-    is_taken,
-    locked,
-    old_path,
-    partial_path,
-    prepare,
-    side_path,
-    state_path,
-    tidy,
-    write_text,
-)
-from mlbatch.writers.base import (
-    NO_COMPRESSION,
-    FilesWriter,
-    ScanJob,
-    ScanWriter,
-    WriterModule,
-    WriterOptions,
-)
-from mlbatch.writers.durable import sync_entries
+from mlbatch.writers.atomic import REPORT_JSON, SCANS_CSV, discard, side_path
+from mlbatch.writers.base import NO_COMPRESSION, ScanWriter, WriterModule, WriterOptions
 from mlbatch.writers.formats import (
     built_in_names,
     format_module,
@@ -45,56 +17,12 @@ from mlbatch.writers.formats import (
     is_format,
     other_names,
 )
-from mlbatch.writers.threads import jobs_for, parse_jobs
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
     from pathlib import Path
 
     from mlbatch.types import RecordLayout, RunInfo
-
-__all__ = [
-    "FILES_JSONL",
-    "REPORT_JSON",
-    "SCANS_CSV",
-    "SHARD_JSON",
-    "FilesWriter",
-    "ReportPaths",
-    "ScanJob",
-    "ScanWriter",
-    "WriterOptions",
-    "check_compression",
-    "check_free_space",
-    "check_name",
-    "check_options",
-    "check_target",
-    "check_variants",
-    "choose_format",
-    "discard",
-    "export_errors",
-    "extras",
-    "format_names",
-    "free_bytes",
-    "has_several_files",
-    "is_report",
-    "is_taken",
-    "jobs_for",
-    "locked",
-    "old_path",
-    "one_file_format",
-    "open_writer",
-    "parse_jobs",
-    "partial_path",
-    "plugin",
-    "prepare",
-    "record_layout",
-    "report_paths",
-    "side_path",
-    "state_path",
-    "sync_entries",
-    "tidy",
-    "write_text",
-]
 
 DEFAULT_FORMAT = "npz"
 # Formats of which a scan may be an output of its own.

@@ -36,7 +36,8 @@ from mlbatch.types import (
     StreamTable,
     Summary,
 )
-from mlbatch.writers import ScanJob, ScanWriter, WriterOptions, extras, open_writer
+from mlbatch.writers import extras, open_writer
+from mlbatch.writers.base import ScanJob, ScanWriter, WriterOptions
 from tests.builders.parser import parser
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -9,7 +9,7 @@ import numpy as np
 
 from mlbatch.arrays import F64Array
 from mlbatch.types import ImuSamples, RunInfo, Scan, SensorInfo, Summary
-from mlbatch.writers import ScanJob
+from mlbatch.writers.base import ScanJob
 
 START_NS = 1_700_000_000_100_000_000
 PERIOD_NS = 100_000_000

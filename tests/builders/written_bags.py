@@ -12,7 +12,8 @@ import pytest
 from mcap.reader import make_reader
 
 from mlbatch.types import Message, Scan, Topic
-from mlbatch.writers import WriterOptions, open_writer
+from mlbatch.writers import open_writer
+from mlbatch.writers.base import WriterOptions
 from tests.builders.scans import (
     PERIOD_NS,
     START_NS,

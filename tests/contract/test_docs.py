@@ -30,7 +30,9 @@ from mlbatch.reports.report import build_report
 from mlbatch.rig import yaml_tree
 from mlbatch.ros.packet_types import PACKET_TYPES
 from mlbatch.sensors import MAX_CALIBRATION_BYTES, models
-from mlbatch.writers import format_names, formats
+from mlbatch.writers import formats
+from mlbatch.writers.base import WriterOptions
+from mlbatch.writers.formats import format_names
 from mlbatch.writers.point_layouts import CLOUD_LAYOUTS, PLY_LAYOUT
 from tests.bench.cases import CASES, RECORDINGS
 from tests.consumers.environments import ENVIRONMENTS
@@ -308,14 +310,14 @@ def test_the_example_of_a_writer_runs(tmp_path: Path, monkeypatch: pytest.Monkey
     """Saved in a folder of formats, as extend.md says, it is found and writes every point."""
     shutil.copy(ROOT / "examples" / "mlbatch-example" / "mlbatch_example" / "rawf32.py", tmp_path)
     monkeypatch.setattr(formats, "__path__", [*formats.__path__, str(tmp_path)])
-    writers.format_names.cache_clear()
+    format_names.cache_clear()
     try:
         job = Job((ROOT / FIXTURE,), SensorSelection(rig=ROOT / RIG), extras=frozenset())
-        options = writers.WriterOptions()
+        options = WriterOptions()
         target = tmp_path / "scans"
         _, report = convert(job, lambda info: writers.open_writer("rawf32", target, info, options))
     finally:
-        writers.format_names.cache_clear()
+        format_names.cache_clear()
     files = sorted(target.glob("*.rawf32"))
     assert len(files) == report.scans.written
     assert sum(path.stat().st_size for path in files) == 16 * report.scans.points > 0

@@ -18,6 +18,7 @@ import pytest
 
 from mlbatch import entry_points, readers, sensors, writers
 from mlbatch.errors import UsageError
+from mlbatch.writers.formats import format_names
 from tests.contract.tree import ROOT
 
 EXAMPLE = ROOT / "examples" / "mlbatch-example"
@@ -172,7 +173,7 @@ def other(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A folder of modules and distributions, on the path of this process."""
     monkeypatch.syspath_prepend(str(tmp_path))
     entry_points.forget()
-    writers.format_names.cache_clear()
+    format_names.cache_clear()
     return tmp_path
 
 
@@ -180,7 +181,7 @@ def other(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 def _nothing_remains() -> object:
     yield
     entry_points.forget()
-    writers.format_names.cache_clear()
+    format_names.cache_clear()
 
 
 def test_a_plugin_that_cannot_be_imported(other: Path) -> None:
@@ -204,14 +205,14 @@ def test_a_plugin_without_a_part(other: Path) -> None:
 def test_the_name_of_a_built_in_plugin(other: Path) -> None:
     _distribution(other, "taken", entry_points.WRITERS, "npz = json")
     with pytest.raises(UsageError, match="npz of taken: expected a name of its own"):
-        writers.format_names()
+        format_names()
 
 
 def test_two_plugins_of_one_name(other: Path) -> None:
     _distribution(other, "one", entry_points.WRITERS, "same = one_writer")
     _distribution(other, "two", entry_points.WRITERS, "same = two_writer")
     with pytest.raises(UsageError, match="one plug-in of this name, found those of one and two;"):
-        writers.format_names()
+        format_names()
 
 
 def test_a_writer_of_another_format(other: Path) -> None:

@@ -100,6 +100,18 @@ def test_long_runs_are_summarised_by_their_worst_windows() -> None:
     assert summary.count.sum() == rows
 
 
+def test_partial_windows_alone_have_a_worst_one() -> None:
+    found = read_windows(table(("left",), [[100], [50]], 512, has_head=True), 1)
+    assert found is not None
+    found.complete[-1] = False
+    assert found.worst() == 1
+
+
+def test_slices_beyond_any_number_are_refused() -> None:
+    with pytest.raises(ExportError, match=r"scans\.csv: expected up to .* slices, found 1000"):
+        read_windows(table(("left",), [[512]]), 10**30)
+
+
 @pytest.mark.parametrize("text", ["", "index,slice\n"])
 def test_no_row_is_no_window(text: str) -> None:
     assert read_windows(text, 1) is None

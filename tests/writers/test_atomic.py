@@ -8,8 +8,9 @@ from pathlib import Path
 import pytest
 
 from mlbatch.errors import ExportError
-from mlbatch.writers import WriterOptions, check_free_space, open_writer, write_text
-from mlbatch.writers.atomic import prepare
+from mlbatch.writers import open_writer
+from mlbatch.writers.atomic import check_free_space, prepare, write_text
+from mlbatch.writers.base import WriterOptions
 from tests.builders.scans import SUMMARY, dense_scan, run_info, run_job
 
 

@@ -17,8 +17,8 @@ from rosbags.highlevel import AnyReader
 
 from mlbatch.pipeline import run
 from mlbatch.types import Scan
-from mlbatch.writers import FilesWriter, ScanWriter, WriterOptions, open_writer
-from mlbatch.writers.base import windows_per_file
+from mlbatch.writers import open_writer
+from mlbatch.writers.base import FilesWriter, ScanWriter, WriterOptions, windows_per_file
 from tests.builders.files import Noted
 from tests.builders.scans import PERIOD_NS, START_NS, SUMMARY, dense_scan, imu_samples, run_job
 from tests.builders.sessions import FIXTURE, Shell

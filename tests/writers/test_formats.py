@@ -12,16 +12,9 @@ import pytest
 
 from mlbatch.errors import ExportError, UsageError
 from mlbatch.types import IMU, Scan
-from mlbatch.writers import (
-    WriterOptions,
-    check_target,
-    direct_writes,
-    extras,
-    format_names,
-    open_writer,
-    output_file,
-    plugin,
-)
+from mlbatch.writers import check_target, direct_writes, extras, open_writer, output_file, plugin
+from mlbatch.writers.base import WriterOptions
+from mlbatch.writers.formats import format_names
 from tests.builders.scans import (
     SUMMARY,
     dense_scan,

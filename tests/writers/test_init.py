@@ -12,17 +12,17 @@ import pytest
 
 from mlbatch.errors import UsageError
 from mlbatch.writers import (
-    WriterOptions,
     check_compression,
     check_options,
     check_target,
     choose_format,
     extras,
-    format_names,
     plugin,
     report_paths,
     threads,
 )
+from mlbatch.writers.base import WriterOptions
+from mlbatch.writers.formats import format_names
 from mlbatch.writers.threads import jobs_for, parse_jobs
 
 ROOT = Path(__file__).resolve().parents[2]

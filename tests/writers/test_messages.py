@@ -15,14 +15,9 @@ from rosbags import rosbag1
 from mlbatch.errors import ExportError
 from mlbatch.ros.encoding import Cdr
 from mlbatch.types import IMU, PACKED_ROOM, Message, PackedPoints, Summary, Topic
-from mlbatch.writers import (
-    WriterOptions,
-    extras,
-    format_names,
-    open_writer,
-    plugin,
-    report_paths,
-)
+from mlbatch.writers import extras, open_writer, plugin, report_paths
+from mlbatch.writers.base import WriterOptions
+from mlbatch.writers.formats import format_names
 from mlbatch.writers.message_writer import CloudMessage, static_edges
 from mlbatch.writers.point_layouts import CLOUD_LAYOUTS
 from tests.builders.bags import Body

@@ -22,7 +22,8 @@ import pytest
 
 from mlbatch.errors import ExportError
 from mlbatch.types import Scan
-from mlbatch.writers import WriterOptions, open_writer
+from mlbatch.writers import open_writer
+from mlbatch.writers.base import WriterOptions
 from tests.builders.scans import (
     START_NS,
     SUMMARY,

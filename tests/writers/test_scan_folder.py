@@ -7,7 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from mlbatch.writers import FilesWriter, WriterOptions, open_writer
+from mlbatch.writers import open_writer
+from mlbatch.writers.base import FilesWriter, WriterOptions
 from mlbatch.writers.scan_folder import scan_name
 from tests.builders.files import Noted
 from tests.builders.scans import SUMMARY, dense_scan, run_info, run_job
