@@ -15,7 +15,8 @@ from mlbatch.errors import RecordingError, RigError
 from mlbatch.readers.datasets import BAG_METADATA, found_in_folder
 
 _BAG_FILE = re.compile(r"\.(db3|mcap)(\.(zstd|zst|gz))?$", re.IGNORECASE)
-# Folders of bags that an error names.
+_RECORDING = re.compile(r"\.(db3|mcap|bag|pcap|pcapng|cap)(\.(zstd|zst|gz))?$", re.IGNORECASE)
+# Folders that an error names.
 _SHOWN = 3
 
 
@@ -38,11 +39,15 @@ def bag_folder(folder: Path) -> BagFolder:
             "check its access rights"
         ) from err
     if not files:
-        bags = [path.name for path in inside if has_bag(path)]
-        if bags:
+        inner = [path.name for path in inside if has_bag(path, _RECORDING)]
+        if inner:
+            shown = ", ".join(inner[:_SHOWN]) + (", ..." if len(inner) > _SHOWN else "")
+            many = (
+                f", or of several drives: mlbatch batch '{folder}/*/' -o OUT" if inner[1:] else ""
+            )
             raise RecordingError(
-                f"{folder}: expected a recording, found a folder with folders of bags "
-                f"({', '.join(bags[:_SHOWN])}); name {folder / bags[0]}"
+                f"{folder}: expected the recordings of one drive, found {len(inner)} folder(s) "
+                f"with recordings ({shown}); name {folder / inner[0]}{many}"
             )
         known = found_in_folder(folder)
         if known:
@@ -59,10 +64,10 @@ def bag_folder(folder: Path) -> BagFolder:
     return BagFolder(tuple(filled), (*notes, *_stale(folder / BAG_METADATA, names, filled)))
 
 
-def has_bag(path: Path) -> bool:
-    """Whether a path is a folder with files of a bag."""
+def has_bag(path: Path, names: re.Pattern[str] = _BAG_FILE) -> bool:
+    """Whether a path is a folder with files of a bag, or with other names."""
     try:
-        return path.is_dir() and any(_BAG_FILE.search(file.name) for file in path.iterdir())
+        return path.is_dir() and any(names.search(file.name) for file in path.iterdir())
     except OSError:
         return False
 

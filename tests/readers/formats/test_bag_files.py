@@ -367,6 +367,7 @@ REFUSED: Mapping[str, tuple[bytes, str]] = {
     "a.db3": (_database(), "expected a ROS 2 bag (tables topics and messages), found a database"),
     "empty/a.db3": (b"", "found 0 bytes"),
     "papers/a.txt": (b"", "found a folder without .db3 or .mcap files; name the files inside it"),
+    "above/drive/a.pcapng": (b"", "found 1 folder(s) with recordings (drive); name "),
     "text/a.db3": (b"no database", "check that it is the right file"),
     "capture/a.db3": (
         b"\xd4\xc3\xb2\xa1" + bytes(16) + b"\1\0\0\0",
@@ -378,7 +379,7 @@ REFUSED: Mapping[str, tuple[bytes, str]] = {
 @pytest.mark.parametrize("name", REFUSED)
 def test_what_cannot_be_read_is_said_in_one_line(name: str, tmp_path: Path) -> None:
     content, said = REFUSED[name]
-    (tmp_path / name).parent.mkdir(exist_ok=True)
+    (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
     (tmp_path / name).write_bytes(content)
     assert said in refusal(tmp_path / name.partition("/")[0])
     assert "found no such file; check the path" in refusal(tmp_path / "none")
