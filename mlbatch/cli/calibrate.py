@@ -39,12 +39,13 @@ def calibrate(
         ),
     ] = False,
     as_json: AsJson = False,
+    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress.")] = False,
     verbose: Verbose = False,
     **values: Any,
 ) -> None:
     """Refine the poses of a rig's lidars by the surfaces that they share."""
     from mlbatch.api import run_calibration
-    from mlbatch.cli.progress import progress_bar
+    from mlbatch.cli.progress import progress_bar, stage_lines
     from mlbatch.cli.tables import paragraph, table_lines
     from mlbatch.cli.values import long_name
     from mlbatch.python.calibrate import CalibrateOptions, calibrate_job
@@ -52,7 +53,10 @@ def calibrate(
     html, overwrite = values.pop("html"), values.pop("overwrite")
     options = cast(CalibrateOptions, values)
     job = calibrate_job(tuple(recordings), rig, options, from_motion=from_motion, shown=long_name)
-    with progress_bar("calibrate", is_verbose=verbose) as progress:
+    with (
+        progress_bar("calibrate", is_shown=not quiet, is_verbose=verbose) as progress,
+        stage_lines("calibrate", is_shown=not quiet),
+    ):
         found = run_calibration(
             job,
             output,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import logging
 import sys
 import time
 from collections.abc import Callable, Iterator
@@ -112,6 +113,24 @@ def progress_bar(
         yield Reporter(stages, unit, Lines())
     else:
         yield None
+
+
+@contextlib.contextmanager
+def stage_lines(name: str, *, is_shown: bool = True) -> Iterator[None]:
+    """Print what a logger says, a line each, as `mlbatch: name: ...`."""
+    logger, handler = logging.getLogger(f"mlbatch.{name}"), logging.Handler()
+    handler.emit = lambda record: typer.echo(  # type: ignore[method-assign]
+        f"mlbatch: {name}: {record.getMessage()}", err=True
+    )
+    before = logger.level
+    if is_shown:
+        logger.addHandler(handler)
+        logger.setLevel(logging.INFO)
+    try:
+        yield
+    finally:
+        logger.removeHandler(handler)
+        logger.setLevel(before)
 
 
 @contextlib.contextmanager

@@ -7,6 +7,7 @@ two lidars are apart before and after, and which poses these places alone would 
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import combinations
@@ -67,6 +68,8 @@ _AT_REST_MPS, _AT_REST_RADPS = 0.05, 0.01
 _DIGITS = 6
 MS_PER_S = 1000.0
 SCHEMA = "mlbatch.calibration/1"
+# Says what is done: a calibration takes minutes.
+STAGES = logging.getLogger("mlbatch.calibrate")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -309,12 +312,14 @@ def calibrated(
     fitted = places.fitted()
 
     def found_from(start: State) -> Solution:
+        STAGES.info("solving for the poses of %d lidars in %d places", len(names), len(fitted))
         return find_poses(fitted, len(names), delays=delays, guess=start, known=known)
 
     found = found_from(_start(begin, len(fitted)))
     try:
         return _measured(places, names, poses, begin, found, known, delays=delays)
     except RecordingError:
+        STAGES.info("refused; looking for a start from which more surfaces agree")
         better = better_start(fitted, found.state)
         if better is None:
             raise
@@ -340,6 +345,7 @@ def _measured(
     guessed = _corrected_poses(poses, begin)
     refined = _corrected_poses(poses, found.state)
     _refuse_far(names, guessed, refined)
+    STAGES.info("measuring the poses in %d places that were left out", len(held_out))
     again = find_poses(held_out, len(names), guess=_start(found.state, len(held_out)))
     twists = again.state.twists
     before = _agreements(held_out, _with_twists(begin, twists))

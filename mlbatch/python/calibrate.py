@@ -28,6 +28,7 @@ from mlbatch.poses.calibration import (
     MOST_OFF_DEG,
     MOST_OFF_M,
     MS_PER_S,
+    STAGES,
     Calibration,
     LidarPose,
     Undetermined,
@@ -278,6 +279,7 @@ def _motion(
     most: int | None,
 ) -> MotionPoses:
     """The motion of some lidars, the first ones of a run, in all or `most` windows."""
+    STAGES.info("reading for the motion of %s", ", ".join(names))
     with contextlib.closing(_scans(run, progress)) as scans:
         return poses_from_motion(_motion_windows(islice(scans, most), poses), names)
 
@@ -285,6 +287,7 @@ def _motion(
 def _places(run: Conversion, progress: Progress | None) -> Places:
     """The places of a run; none where it has no whole window."""
     lidars = len(run.sensors)
+    STAGES.info("reading for places that several lidars see")
     try:
         with contextlib.closing(_scans(run, progress)) as scans:
             return places_of(scans, lidars)

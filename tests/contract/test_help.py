@@ -53,7 +53,7 @@ OPTIONS: dict[str, set[str]] = {
         "calibrate": """
             rig output metadata only clock align-clocks start end time-offset
             from-motion html overwrite
-            json verbose
+            json quiet verbose
         """,
         "digest": "output against overwrite",
         "diff": "tolerance json",
