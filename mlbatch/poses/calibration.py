@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations
 
 import numpy as np
@@ -22,17 +22,17 @@ from mlbatch.motion.se3 import log_rotation, skew
 from mlbatch.poses.from_motion import MotionPoses
 from mlbatch.poses.places import Places
 from mlbatch.poses.solve import (
-    LEVELS,
-    Cloud,
+    FINE,
     Known,
     Place,
     Problem,
     Solution,
     State,
+    at_instant,
     better_start,
     estimate,
     find_poses,
-    moved,
+    move_between,
     solve,
 )
 from mlbatch.poses.surfaces import distances, shared_cells
@@ -315,7 +315,7 @@ def calibrated(
         STAGES.info("solving for the poses of %d lidars in %d places", len(names), len(fitted))
         return find_poses(fitted, len(names), delays=delays, guess=start, known=known)
 
-    found = found_from(_start(begin, len(fitted)))
+    found = found_from(begin)
     try:
         return _measured(places, names, poses, begin, found, known, delays=delays)
     except RecordingError:
@@ -346,10 +346,10 @@ def _measured(
     refined = _corrected_poses(poses, found.state)
     _refuse_far(names, guessed, refined)
     STAGES.info("measuring the poses in %d places that were left out", len(held_out))
-    again = find_poses(held_out, len(names), guess=_start(found.state, len(held_out)))
+    again = find_poses(held_out, len(names), guess=found.state)
     twists = again.state.twists
-    before = _agreements(held_out, _with_twists(begin, twists))
-    after = _agreements(held_out, _with_twists(found.state, twists))
+    before = _agreements(held_out, replace(begin, twists=twists))
+    after = _agreements(held_out, replace(found.state, twists=twists))
     pairs = tuple(
         LidarPair(names[a], names[b], before[a, b], after[a, b])
         for a, b in combinations(range(len(names)), 2)
@@ -369,16 +369,6 @@ def _measured(
         places.windows,
         _view(held_out, begin, found.state, twists),
     )
-
-
-def _start(state: State, places: int) -> State:
-    """The poses of a state for other places."""
-    return State(list(state.corrections), np.zeros((places, 6)), state.delay_s.copy())
-
-
-def _with_twists(state: State, twists: F64Array) -> State:
-    """A state with the motion of other places (places, 6)."""
-    return State(state.corrections, twists, state.delay_s)
 
 
 def motion_poses(first: F64Array, motion: MotionPoses) -> list[F64Array]:
@@ -550,11 +540,7 @@ def _differences(
     units = np.array([1.0] * 3 + [1.0 / _LEVER_M] * 3)
     size = len(found.covariance) // (len(poses) - 1)
     for number in range(1, len(poses)):
-        one, other = found.state.corrections[number], again.state.corrections[number]
-        turn = np.matmul(other.rotation, one.rotation.T)
-        off = np.concatenate(
-            [other.position_m - np.matmul(turn, one.position_m), log_rotation(turn[None])[0]]
-        )
+        off = move_between(found.state.corrections[number], again.state.corrections[number])
         at, at_again = size * (number - 1), 6 * (number - 1)
         for axis in again.weak[at_again : at_again + 6].T:
             off = off - units * axis * float(axis @ (off / units))
@@ -634,11 +620,11 @@ def _refuse_unseen(found: Solution, names: Sequence[str]) -> None:
 
 def _refuse_late(problem: Problem, found: Solution, names: Sequence[str]) -> None:
     """Refuse poses that make up for timestamps that are late."""
-    seems = estimate(problem, problem.rows(found.state, LEVELS[-1]), found.state)
+    seems = estimate(problem, problem.rows(found.state, FINE), found.state)
     # One match may be too short.
     if not any(late for *_, late in _delays(seems, names, 0.5)):
         return
-    late = solve(problem, found.state, LEVELS[-1])
+    late = solve(problem, found.state, FINE)
     for name, delay, sigma, is_late in _delays(late, names):
         if is_late:
             raise _refused(
@@ -797,7 +783,7 @@ def _view(places: Sequence[Place], start: State, found: State, twists: F64Array)
         return tuple(
             np.concatenate(
                 [
-                    _placed(cloud, state, twists[number])
+                    at_instant(cloud, state, twists[number])[0].astype(np.float32)
                     for cloud in places[number]
                     if cloud.lidar == lidar
                 ]
@@ -806,10 +792,3 @@ def _view(places: Sequence[Place], start: State, found: State, twists: F64Array)
         )
 
     return View(points(start), points(found))
-
-
-def _placed(cloud: Cloud, state: State, twist: F64Array) -> F32Array:
-    pose = state.corrections[cloud.lidar]
-    points_m = np.matmul(cloud.points_m, pose.rotation.T) + pose.position_m
-    time_s = cloud.time_s + state.delay_s[cloud.lidar]
-    return moved(points_m, time_s, twist).astype(np.float32)

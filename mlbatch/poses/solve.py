@@ -196,11 +196,9 @@ class Known:
         """How far a state is from it (lidars - 1, 7)."""
         rows = []
         for lidar in range(1, len(state.corrections)):
-            pose, other = state.corrections[lidar], self.state.corrections[lidar]
-            turn = np.matmul(pose.rotation, other.rotation.T)
-            shift_m = pose.position_m - np.matmul(turn, other.position_m)
             late_s = state.delay_s[lidar] - self.state.delay_s[lidar]
-            rows.append(np.concatenate([shift_m, log_rotation(turn[None])[0], [late_s]]))
+            off = move_between(self.state.corrections[lidar], state.corrections[lidar])
+            rows.append(np.append(off, late_s))
         return np.array(rows)
 
 
@@ -246,11 +244,7 @@ class Problem:
         for cloud in self.places[place]:
             # An odd step takes all beams in turn.
             step = -(-len(cloud.points_m) // level.points) | 1
-            time_s = cloud.time_s[::step] + state.delay_s[cloud.lidar]
-            # What follows is faster column by column.
-            points_m = np.asfortranarray(cloud.points_m[::step])
-            points_m = _corrected(points_m, state.corrections[cloud.lidar])
-            points_m = moved(points_m, time_s, state.twists[place])
+            points_m, time_s = at_instant(cloud, state, state.twists[place], step)
             sizes = [Moments.of_points(points_m, time_s, level.edge_m)]
             for _ in range(level.doubled):
                 sizes.append(sizes[-1].doubled())
@@ -329,6 +323,17 @@ class Problem:
         return jacobian
 
 
+def at_instant(
+    cloud: Cloud, state: State, twist: F64Array, step: int = 1
+) -> tuple[F64Array, F64Array]:
+    """Every so many of the points of a cloud, moved to the instant of its place; their times."""
+    time_s = cloud.time_s[::step] + state.delay_s[cloud.lidar]
+    # What follows is faster column by column.
+    points_m = np.asfortranarray(cloud.points_m[::step])
+    points_m = _corrected(points_m, state.corrections[cloud.lidar])
+    return moved(points_m, time_s, twist), time_s
+
+
 def _corrected(points_m: F64Array, pose: Pose) -> F64Array:
     if pose is ORIGIN:
         return points_m
@@ -365,21 +370,17 @@ class Solution(NamedTuple):
 
     covariance: (poses, poses) of the corrections, twists eliminated, m and rad; weak: (poses, w),
     unit directions (a turn counts 10 m a rad) that the scene does not determine, in which the
-    covariance is that of 1 m; matched: of each pair of lidars, distances that were used; rms: of
-    residuals in standard deviations.
+    covariance is that of 1 m; matched: of each pair of lidars, distances that were used.
     """
 
     state: State
     covariance: F64Array
     weak: F64Array
     matched: dict[tuple[int, int], int]
-    rms: float
-    converged: bool
 
 
 def solve(problem: Problem, state: State, level: Level, most_steps: int = 25) -> Solution:
     """Damped Gauss-Newton from a state, with surfaces matched anew in each step."""
-    converged = False
     equations = _Equations(problem, problem.rows(state, level), state)
     before, longer = np.zeros(problem.poses), 1.0
     for _ in range(most_steps):
@@ -399,10 +400,9 @@ def solve(problem: Problem, state: State, level: Level, most_steps: int = 25) ->
             poses -= np.matmul(weak, np.matmul(weak.T, poses))
             step[: problem.poses] = poses * equations.units
         if _is_small(problem, step, max(1.0, level.most_m / FINE.most_m) ** 2):
-            converged = True
             break
     covariance, weak = equations.determined()
-    return Solution(state, covariance, weak, equations.matched(), equations.rms, converged)
+    return Solution(state, covariance, weak, equations.matched())
 
 
 def estimate(
@@ -427,7 +427,7 @@ def estimate(
         ]
         equations = _Equations(problem, rows, state)
     covariance, weak = equations.determined(most_sigma_m)
-    return Solution(state, covariance, weak, equations.matched(), equations.rms, False)
+    return Solution(state, covariance, weak, equations.matched())
 
 
 def find_poses(
@@ -440,10 +440,12 @@ def find_poses(
 ) -> Solution:
     """Solve for the poses of all lidars, coarse to fine.
 
-    guess: where to start, else the poses that the points were converted with; up to 20 degrees and
-    1 m off.
+    guess: corrections and delays to start with, else the poses that the points were converted with;
+    up to 20 degrees and 1 m off.
     """
-    state = guess or State.start(lidars, len(places))
+    state = State.start(lidars, len(places))
+    if guess is not None:
+        state = replace(guess, twists=state.twists)
     problem = Problem(places, lidars, known=known)
     afar, *_, fine = _SEARCH
     # A few places say where lidars are, about.
@@ -486,7 +488,7 @@ def better_start(places: Sequence[Place], end: State) -> State | None:
             best, most = state, agreeing
     if most <= _MORE * first:
         return None
-    return State(best.corrections, np.zeros((len(places), 6)), best.delay_s)
+    return best
 
 
 def _agreeing(problem: Problem, state: State) -> int:
@@ -494,6 +496,13 @@ def _agreeing(problem: Problem, state: State) -> int:
     return sum(
         int((rows.pair[:, 0] != rows.pair[:, 1]).sum()) for rows in problem.rows(state, _AGREES)
     )
+
+
+def move_between(one: Pose, other: Pose) -> F64Array:
+    """The motion (6,) that leads from a correction to another, m and rad."""
+    turn = np.matmul(other.rotation, one.rotation.T)
+    shift_m = other.position_m - np.matmul(turn, one.position_m)
+    return np.concatenate([shift_m, log_rotation(turn[None])[0]])
 
 
 def after_move(pose: Pose, move: Pose) -> Pose:
@@ -572,11 +581,6 @@ class _Equations:
         self._residual = [part.residual / part.scale for part in rows]
         # Share of each residual in the kernel.
         self._off = [(residual / KERNEL) ** 2 for residual in self._residual]
-        squares = sum(
-            float((residual**2 / (1.0 + off)).sum())
-            for residual, off in zip(self._residual, self._off, strict=True)
-        )
-        self.rms = float(np.sqrt(squares / max(1, sum(map(len, self._residual)))))
 
     def step(self) -> F64Array:
         """Change of all unknowns."""
