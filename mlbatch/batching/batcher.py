@@ -24,8 +24,7 @@ from typing import NamedTuple
 import numpy as np
 
 from mlbatch.arrays import BoolArray, I64Array
-from mlbatch.batching.fill import UNKNOWN_PACE, FillMeter, Pace
-from mlbatch.batching.gaps import EdgeGaps
+from mlbatch.batching.fill import UNKNOWN_PACE, EdgeGaps, FillMeter, Pace
 from mlbatch.batching.grid import Grid
 from mlbatch.batching.intake import FOREVER, NEVER, STEP_NS, Accepted, Intake
 from mlbatch.batching.merge import ColumnMerge

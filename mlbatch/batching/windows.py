@@ -90,7 +90,7 @@ class Window:
     ready_host_ns: int  # receive time of the packet that closed it
     columns: WindowColumns
     figures: WindowFigures  # by sensor
-    # By sensor: see `gaps.EdgeGaps` and `fill.FillMeter`.
+    # By sensor: see `EdgeGaps` and `FillMeter` in `fill.py`.
     edge_gap_ns: tuple[int, ...]
     fill: F32Array
     is_partial: bool  # the head or the tail

@@ -10,7 +10,7 @@ from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING
 
 from mlbatch.arrays import I64Array
-from mlbatch.clocks.compare import Comparison, compare
+from mlbatch.clocks.compare import SYNCHRONISED, Comparison, compare
 from mlbatch.clocks.watch import ClockEstimate
 from mlbatch.discovery.router import Router
 from mlbatch.discovery.sampler import clock_watch
@@ -22,10 +22,6 @@ from mlbatch.types import PacketBatch
 
 if TYPE_CHECKING:
     from mlbatch.faults import FaultReplay
-
-SYNCHRONISED = "synchronised"
-# Warning codes by kind of clock step.
-_WARNINGS = {"host": "host_step"}
 
 
 class ClockMonitor:
@@ -84,8 +80,8 @@ class ClockMonitor:
         notes = []
         for name, finding in comparison.estimates:
             for jump in finding.jumps:
-                text = f"{name}: {jump.describe()}"
-                notes.append(Note(_WARNINGS.get(jump.kind, "clock_jump"), name, text))
+                code = "host_step" if jump.kind == "host" else "clock_jump"
+                notes.append(Note(code, name, f"{name}: {jump.describe()}"))
         notes += [
             Note("clocks", "", pair.describe())
             for pair in comparison.pairs

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from mlbatch.arrays import BoolArray, I64Array
-from mlbatch.batching.fill import FillMeter, Pace
-from mlbatch.batching.gaps import EdgeGaps
+from mlbatch.batching.fill import EdgeGaps, FillMeter, Pace
 from mlbatch.types import NO_COLUMNS, ColumnFigures, WindowColumns
 
 NS_PER_S = 10**9

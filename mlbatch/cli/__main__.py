@@ -1,5 +1,0 @@
-"""`python -m mlbatch.cli`."""
-
-from mlbatch.cli import main
-
-main()
