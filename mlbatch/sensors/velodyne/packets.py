@@ -6,6 +6,7 @@ packet has one timestamp and an azimuth for each block, from which those of all 
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -66,13 +67,12 @@ class Measured:
     timestamp_mode: str = ""
 
 
-@dataclass(frozen=True, slots=True)
-class Options:
-    """Values of --decode for Velodyne."""
-
-    firing_azimuth: bool = True
-    vertical_offset: bool = True
-    stamp_is_end: bool = False
+# Values of --decode for Velodyne, where none is given.
+DEFAULTS: Mapping[str, str] = {
+    "firing_azimuth": "on",
+    "vertical_offset": "on",
+    "packet_stamp": "start",
+}
 
 
 class VelodyneLidar(Lidar):
@@ -83,12 +83,12 @@ class VelodyneLidar(Lidar):
         model: Model,
         file: VelodyneFile | None,
         measured: Measured,
-        options: Options,
+        options: Mapping[str, str],
         notes: tuple[str, ...],
     ) -> None:
         returns = 2 if measured.mode == DUAL else 1
         self._model = model
-        self._options = options
+        self._is_raised = options["vertical_offset"] == "on"
         self._file = file
         where = layout(model, returns)
         self.vendor = VENDOR
@@ -110,7 +110,7 @@ class VelodyneLidar(Lidar):
         self.return_types = _RETURN_TYPES.get(measured.mode, (0,))
         self.firing_ns = model.firing_ns(measured.sequence_ns)
         self.firing_ns[:, dark] = -1
-        self.beams = beam_table(model, file, raised=options.vertical_offset)
+        self.beams = beam_table(model, file, raised=self._is_raised)
         elevation = np.array(model.elevation_deg) if file is None else file.elevation_rad
         self.channel = ranks(elevation)
         self.calibration = "built in" if file is None else str(file.path)
@@ -125,13 +125,13 @@ class VelodyneLidar(Lidar):
         if not self._model.needs_file or self._file is None:
             return None
         file = self._file
-        if not self._options.vertical_offset:
+        if not self._is_raised:
             file = replace(file, vert_offset_m=np.zeros_like(file.vert_offset_m))
         return hdl64_projection(file, body_from_sensor)
 
 
 def header_table(
-    model: Model, where: Layout, measured: Measured, options: Options, firing_ns: I64Array
+    model: Model, where: Layout, measured: Measured, options: Mapping[str, str], firing_ns: I64Array
 ) -> PacedBlocks:
     """Layout of the headers; firing_ns: as of the `Lidar`."""
     returns = 2 if measured.mode == DUAL else 1
@@ -140,7 +140,7 @@ def header_table(
     # First firing of each column, after the packet's stamp and after its block's azimuth.
     number = np.arange(where.columns)
     start_ns = np.rint(number * sequence_ns).astype(np.int64) + model.stamp_ns
-    if options.stamp_is_end and model.stamp_may_end:
+    if options["packet_stamp"] == "end" and model.stamp_may_end:
         start_ns -= start_ns[-1] + firing_ns.max()
     ahead_ns: F64Array = (number % model.halves).astype(np.float64) * sequence_ns
     return PacedBlocks(
@@ -166,7 +166,7 @@ def header_table(
         known_speed=measured.speed,
         slowest=_SLOWEST,
         tolerance=_SPEED_TOLERANCE,
-        follows_rotor=options.firing_azimuth,
+        follows_rotor=options["firing_azimuth"] == "on",
     )
 
 

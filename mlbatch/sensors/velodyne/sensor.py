@@ -28,9 +28,9 @@ from mlbatch.sensors.velodyne.clock import (
 from mlbatch.sensors.velodyne.identify import Identity, describe, identify, is_pace
 from mlbatch.sensors.velodyne.models import ALL, Model, layout
 from mlbatch.sensors.velodyne.packets import (
+    DEFAULTS,
     VENDOR,
     Measured,
-    Options,
     VelodyneLidar,
     first_azimuths,
     header_table,
@@ -53,7 +53,6 @@ _FITS_FILE = 200
 # Largest mean difference between the angles of a file and those of its model.
 _ANGLE_TOLERANCE_DEG = 3.0
 _UNIT_TOLERANCE = 1e-6
-_OPTIONS = {"firing_azimuth": "on", "vertical_offset": "on", "packet_stamp": "start"}
 # Default ports: docs/sources/messages.md, section 7; topics and messages: section 1.
 RECORDED = Recorded(
     port=2368,
@@ -123,7 +122,7 @@ class VelodyneCalibration(Calibration):
     def lidar(self, options: Mapping[str, str], evidence: Evidence | None) -> VelodyneLidar:
         """Decoder of the sensor; RigError if its model needs a file."""
         check_options(options)
-        chosen = {**_OPTIONS, **options}
+        chosen = {**DEFAULTS, **options}
         if self.row.needs_file and self.file is None:
             raise RigError(
                 f"{self.row.reported_as}: expected its calibration, found none; give the unit's "
@@ -139,17 +138,7 @@ class VelodyneCalibration(Calibration):
             if has_heights and self.row.height_mm and not file.vert_offset_m.any():
                 file, note = _with_built_in_heights(file, self.row)
                 notes.append(note)
-        return VelodyneLidar(
-            self.row,
-            file,
-            measured,
-            Options(
-                firing_azimuth=chosen["firing_azimuth"] == "on",
-                vertical_offset=has_heights,
-                stamp_is_end=chosen["packet_stamp"] == "end",
-            ),
-            tuple(notes),
-        )
+        return VelodyneLidar(self.row, file, measured, chosen, tuple(notes))
 
 
 # Includes the HDL-64E, whose entry raises the error about its missing file.
@@ -246,7 +235,7 @@ def _measure(row: Model, evidence: Evidence | None) -> tuple[Measured, list[str]
     packets = evidence.sample
     host_ns = evidence.host_ns
     first = Measured(seen.mode, row.sequence_ns)
-    table = header_table(row, where, first, Options(), row.firing_ns(row.sequence_ns))
+    table = header_table(row, where, first, DEFAULTS, row.firing_ns(row.sequence_ns))
     good = HeaderReader(table, has_number=False).read_rows(packets).faults == 0
     packets = packets[good]
     host_ns = host_ns[good]

@@ -14,7 +14,7 @@ import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime, timedelta
-from typing import ClassVar, Protocol
+from typing import ClassVar
 
 import numpy as np
 
@@ -53,14 +53,6 @@ _MIRROR_STARTS_DEG = (20.0, 140.0, 260.0)
 _HALF_VIEW_DEG = 60.0
 _SIGNATURE = bytes(range(32))
 _REVERSED_BITS = bytes(int(f"{byte:08b}"[::-1], 2) for byte in range(256))
-
-
-class Beams(Protocol):
-    """Where the beams of a lidar look."""
-
-    def aim(self, rotor_deg: F64Array) -> tuple[F64Array, F64Array]:
-        """Azimuth and elevation (n, channels), deg, at rotor angles (n, channels)."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -193,7 +185,7 @@ class HesaiSpec(SpinningSpec):
         return self.start_ns
 
     @property
-    def beams(self) -> Beams:
+    def beams(self) -> Angles | MirrorAngles:
         """Angles of a made-up unit."""
         elevation, azimuth = fan(self.model, self.channels)
         if self.model == "AT128":
