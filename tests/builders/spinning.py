@@ -11,9 +11,10 @@ import numpy as np
 
 from mlbatch.arrays import BoolArray, F64Array, I64Array, U8Array
 from mlbatch.lidar.geometry import read_rotor_words
+from mlbatch.lidar.headers import Headers, content_keys
 from mlbatch.lidar.interface import Calibration, Evidence, Lidar, NeighbourStream
 from mlbatch.sensors import built_in, parse_calibration
-from mlbatch.simulate.ouster.encode import OusterSpec, metadata_json
+from mlbatch.simulate.ouster.encode import OusterSpec, encode_packets, metadata_json
 from mlbatch.simulate.robosense.encode import RobosenseSpec
 from mlbatch.simulate.spinning import SpinningSpec
 from mlbatch.simulate.velodyne.models import MODELS, calibration_yaml
@@ -21,6 +22,7 @@ from mlbatch.types import ColumnHeaders, Stream
 from tests.builders.decoded import Readings, readings
 from tests.builders.lidar_packets import encoded
 from tests.builders.others import rows
+from tests.reference.headers import read
 
 STREAM = Stream("192.168.1.201", 2368)
 DIFOP = Stream("192.168.1.201", 7788)
@@ -199,3 +201,32 @@ def velodyne_calibration(model: str) -> Calibration:
     if model in PLAIN:
         return next(one for one in built_in() if one.model == model)
     return named(model, from_file(calibration_yaml(model), "unit.yaml"))
+
+
+def ouster_packets(spec: OusterSpec, columns: int = 48) -> tuple[Lidar, U8Array]:
+    """A lidar and whole packets of it, at the end of a frame and the start of the next."""
+    lidar = ouster_calibration(spec).lidar({}, None)
+    number = spec.columns_per_frame - columns // 3 + np.arange(columns)
+    frame = 65535 + number // spec.columns_per_frame
+    stamp_ns = 10**18 + 97_000 * np.arange(columns)
+    packets = encode_packets(spec, stamp_ns, number % spec.columns_per_frame, frame % 65536, {})
+    return lidar, rows(packets)
+
+
+def check_headers(lidar: Lidar, packets: U8Array, host_ns: I64Array) -> Headers:
+    """The loops read what the packets literally say; those begin at any byte of a buffer."""
+    assert lidar.reader is not None
+    size = packets.shape[1]
+    buffer = np.concatenate([np.zeros(3, np.uint8), packets.reshape(-1)])
+    found = lidar.reader.read(buffer, 3 + np.arange(len(packets)) * size, host_ns)
+    hashes = content_keys(packets).tolist()
+    for row, packet in enumerate(packets):
+        seen = read(lidar.reader.table, packet.tobytes(), int(host_ns[row]))
+        assert (bool(found.is_mine[row]), int(found.faults[row])) == (seen.is_mine, seen.fault)
+        if not seen.is_mine or seen.fault:
+            continue
+        assert int(found.key[row]) == (hashes[row] if seen.key is None else seen.key)
+        columns = found.columns
+        arrays = (columns.stamp_ns, columns.encoder, columns.valid)
+        assert list(zip(*(one[row].tolist() for one in arrays), strict=True)) == seen.columns
+    return found

@@ -43,8 +43,7 @@ from mlbatch.types import (
 from tests.builders.captures import udp_frame
 from tests.builders.decoded import rotor_words
 from tests.builders.engines import BOXES_M, Pair
-from tests.builders.headers import check_headers, ouster_packets
-from tests.builders.spinning import PLAIN, stream_of
+from tests.builders.spinning import PLAIN, check_headers, ouster_packets, stream_of
 from tests.decode.test_engine import (
     END_NS,
     NAMES,

@@ -17,8 +17,7 @@ from mlbatch.lidar.interface import Lidar
 from mlbatch.sensors.ouster.profiles import FUSA, PROFILES, STANDARD
 from mlbatch.simulate.ouster.encode import OusterSpec
 from mlbatch.simulate.velodyne.encode import VelodyneSpec
-from tests.builders.headers import check_headers, ouster_packets
-from tests.builders.spinning import stream_of
+from tests.builders.spinning import check_headers, ouster_packets, stream_of
 from tests.contract.test_models import cases
 
 SERIAL = 122201000998

@@ -17,9 +17,9 @@ from mlbatch.ros.point_packets import Layout, Points, layout_of, pack
 from mlbatch.sensors.pointcloud.sensor import BUILT_IN, MODELS, CloudLidar
 from mlbatch.types import Stream
 from tests.builders.decoded import readings
-from tests.builders.headers import check_headers
 from tests.builders.points import STAMP_NS, VELODYNE, cloud_message, write_points
 from tests.builders.rosbag2 import write_rosbag2
+from tests.builders.spinning import check_headers
 
 TOPIC = Stream(topic="/left/points")
 CLOUD, CUSTOM = BUILT_IN
