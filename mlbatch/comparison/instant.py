@@ -19,6 +19,7 @@ from mlbatch.batching.windows import Window
 from mlbatch.comparison.places import apart, cells, difference, spot_apart_ms
 from mlbatch.page.instant import InstantSet, SharedInstant, Spot
 from mlbatch.page.points import CloudPoints
+from mlbatch.pipeline.decode_pool import first_ring_index
 from mlbatch.pipeline.sensor import Sensor
 from mlbatch.types import Scan, WindowColumns
 from mlbatch.units import NS_PER_MS, NS_PER_S
@@ -90,8 +91,7 @@ class InstantFinder:
 
     def oldest_ring_index(self, sensor: int) -> int | None:
         """First ring index of a sensor that an instant may need; None: none."""
-        parts = (one.columns.ring_index[one.columns.sensor == sensor] for one in self._windows)
-        return min((int(part.min()) for part in parts if len(part)), default=None)
+        return first_ring_index(self._windows, sensor)
 
     def found(self) -> SharedInstant | None:
         """The instant that differs most so far; None without a set."""

@@ -21,7 +21,7 @@ from mlbatch.units import NS_PER_S
 
 if TYPE_CHECKING:
     from mlbatch.batching.windows import Window
-    from mlbatch.poses.check import PoseComparison
+    from mlbatch.poses.check import Begun, PoseComparison
     from mlbatch.poses.solve import Cloud
 
 # Of a lidar in a window of the first place, and of others: if all is clear, and if more points pay.
@@ -52,10 +52,9 @@ class PoseCheck:
         # Windows so far, and the number of the next one that begins a place.
         self._windows = -1
         self._next = 1
-        # Indexes of the newest window, and of the first window of a place that is not complete,
-        # with its end.
+        # Index of the newest window; a place after its first window, and the end of that.
         self._index: int | None = None
-        self._begun: int | None = None
+        self._begun: Begun | None = None
         self._instant_ns = 0
         # Slices of the newest window, if it is read.
         self._parts: list[list[_Points]] = []
@@ -65,11 +64,11 @@ class PoseCheck:
         if self._is_over or window.is_partial:
             return
         if window.index != self._index:
+            if window.start_ns != self._instant_ns:
+                self._begun = None
             self._windows += 1
             self._index = window.index
             self._parts = []
-            if self._begun != window.index - 1:
-                self._begun = None
         if self._windows < self._next:
             return
         self._parts.append([self._points(window, lidar) for lidar in range(len(self._sensors))])
@@ -111,10 +110,9 @@ class PoseCheck:
             self._comparison = PoseComparison(names, poses, _as_radians(self._sensors))
         if self._begun is None:
             self._instant_ns = window.end_ns
-            needs_next = self._comparison.begin(self._clouds())
-            self._begun = window.index if needs_next else None
+            self._begun = self._comparison.begin(self._clouds())
         else:
-            self._comparison.complete(self._clouds())
+            self._comparison.complete(self._begun, self._clouds())
             self._begun = None
         if self._begun is None:
             self._next = 2 * self._next + 1

@@ -118,7 +118,7 @@ class _Shared(NamedTuple):
         return self.both >= _LEAST_SURFACES and self.fit < _FITS * self.both
 
 
-class _Begun(NamedTuple):
+class Begun(NamedTuple):
     """A place of which the first window is there: its motion, planes and what lidars share."""
 
     first: Place
@@ -159,7 +159,6 @@ class PoseComparison:
         self._shared = [_Shared(0, 0, 0)] * len(self._pairs)
         # Places so far, of which some have nothing in common.
         self.places = 0
-        self._begun: _Begun | None = None
         self._places: list[Place] = []
         self._rows: list[Rows] = []
         # Corrections and twists that the rows were matched with.
@@ -186,30 +185,28 @@ class PoseComparison:
 
     def add(self, place: Place) -> None:
         """Compare the clouds of a place: a cloud of each lidar in a window, then in the next."""
-        if self.begin(place[: len(self._names)]):
-            self.complete(place[len(self._names) :])
+        begun = self.begin(place[: len(self._names)])
+        if begun is not None:
+            self.complete(begun, place[len(self._names) :])
 
-    def begin(self, first: Place) -> bool:
-        """Begin a place with a cloud of each lidar; whether the next window is needed as well."""
+    def begin(self, first: Place) -> Begun | None:
+        """Begin a place with a cloud of each lidar; None: the next window would add nothing."""
         state = State.start(len(self._names), 1)
         # A vehicle hardly changes its velocity from place to place.
         if self._rows:
             state.twists[:] = self._state.twists[-1:]
         surfaces = self._planes(first, state)
         shared = self._count(surfaces)
-        self._begun = _Begun(first, state, surfaces, shared)
         if any(one.both > _STRAY for one in shared) or self._may_be_mistaken(first):
-            return True
-        self._end_place()
-        return False
+            return Begun(first, state, surfaces, shared)
+        self._count_place(shared)
+        return None
 
-    def complete(self, second: Place) -> None:
+    def complete(self, begun: Begun, second: Place) -> None:
         """Complete a place with the next window."""
-        if self._begun is None:
-            raise ValueError("expected a place that was begun")
-        first, state, surfaces, shared = self._begun
+        first, state, surfaces, shared = begun
         self._is_misfit |= any(one.is_misfit for one in shared)
-        self._end_place()
+        self._count_place(shared)
         place = [*first, *second]
         self._joined = None
         self._state.twists = np.vstack([self._state.twists, state.twists])
@@ -227,13 +224,11 @@ class PoseComparison:
         pairs = self._measured()
         self.needs_more = _is_any_wrong(pairs) or not self._are_clear(pairs)
 
-    def _end_place(self) -> None:
+    def _count_place(self, shared: Sequence[_Shared]) -> None:
         """Count the surfaces of a place that is complete."""
-        if self._begun is not None:
-            both = zip(self._shared, self._begun.shared, strict=True)
-            self._shared = [so_far.plus(shared) for so_far, shared in both]
-            self.places += 1
-            self._begun = None
+        both = zip(self._shared, shared, strict=True)
+        self._shared = [so_far.plus(more) for so_far, more in both]
+        self.places += 1
 
     def _planes(self, clouds: Place, state: State) -> list[list[Planes]]:
         return Problem([clouds], len(self._names)).planes(0, state, self._level[0])
@@ -340,7 +335,8 @@ class PoseComparison:
             return False
         for key in self._pairs:
             for _, poses in self._others(key):
-                if self._alone(key, poses).begin(self._with_poses(first, key, poses)):
+                clouds = self._with_poses(first, key, poses)
+                if self._alone(key, poses).begin(clouds) is not None:
                     return True
         return False
 
