@@ -21,9 +21,8 @@ METADATA = "metadata.yaml"
 REPORT = "report.json"
 _MAGICS = {b"\x89MCAP0\r\n": "mcap", b"#ROSBAG V2.0\n": "rosbag1"}
 _HEAD_BYTES = 16
-
-
-_RANGES = "ranges to 1 m: beams do not leave from the origin of their sensor"
+# Why `geometry` is limited where beams are not stored.
+RANGES = "ranges to 1 m: beams do not leave from the origin of their sensor"
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,12 +50,12 @@ class FileFormat:
 
 # In the order in which suffixes are looked for: that of kitti is the end of that of nuscenes.
 FILE_FORMATS = (
-    FileFormat("npz", npz.SUFFIX, npz.NpzReader, npz.LIMITS | {"geometry": _RANGES}),
+    FileFormat("npz", npz.SUFFIX, npz.NpzReader, npz.LIMITS | {"geometry": RANGES}),
     FileFormat(
         "webdataset",
         webdataset.SUFFIX,
         webdataset.SampleReader,
-        npz.LIMITS | {"geometry": _RANGES},
+        npz.LIMITS | {"geometry": RANGES},
         webdataset.samples,
     ),
     FileFormat("ply", ply.SUFFIX, ply.PlyReader, commented_limits("PLY")),

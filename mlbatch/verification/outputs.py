@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 from mlbatch.outputs import npz
 from mlbatch.outputs.damage import CheckLog, DamageError, VerifyError
-from mlbatch.outputs.kinds import FileFormat, kind_of
+from mlbatch.outputs.kinds import RANGES, FileFormat, kind_of
 from mlbatch.outputs.metadata import RunMetadata, metadata_of_grid
 from mlbatch.outputs.run_files import PIECES, TABLE, RunFiles
 from mlbatch.verification import messages
@@ -24,7 +24,6 @@ from mlbatch.verification.verdict import Verdict, outcomes
 if TYPE_CHECKING:
     from mlbatch.outputs.rosbag2 import Yaml
 
-_RANGES = "ranges to 1 m: beams do not leave from the origin of their sensor"
 _NO_REPORT = "no report in or next to the output; give it with --report"
 _FOREIGN = "expected an output of mlbatch (a folder of scans, an MCAP file, a bag)"
 _NAME_ONE = "name the output of `mlbatch convert`"
@@ -198,7 +197,7 @@ def _limits(topics: TopicChecks) -> dict[str, str]:
     limits = layout_limits(topics.layout).items()
     own = {check: text for check, text in limits if not topics.log.checked[check]}
     if topics.layout == "ouster":
-        own["geometry"] = _RANGES
+        own["geometry"] = RANGES
     if topics.strange_frames:
         own["frames"] = f"recorded messages name frames that are not there: {topics.strange_frames}"
     if topics.split:
