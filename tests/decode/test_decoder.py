@@ -18,6 +18,7 @@ from mlbatch.simulate.ouster.encode import OusterSpec, encode_packets
 from mlbatch.types import RunInfo, SensorInfo
 from tests.builders.decoded import Readings, readings
 from tests.builders.others import rows
+from tests.builders.run import FIXTURE, in_memory
 from tests.builders.spinning import ouster_calibration
 
 COLUMNS = 512
@@ -94,3 +95,13 @@ def test_windows_without_a_column_or_a_return_have_no_points(columns: int, layou
     scan = decoder.scan(due, ScanHeader(3, 0, 0, 10**8, True, 17))
     assert (scan.points, len(scan.column_stamp_ns)) == (0, columns)
     assert len(scan.xyz) == (columns if layout == "organized" else 0)
+
+
+def test_points_are_counted_by_sensor_in_merged_and_in_split_scans() -> None:
+    whole = in_memory(FIXTURE).scans
+    counts = [np.bincount(scan.lidar_id, minlength=2).tolist() for scan in whole]
+    assert [list(scan.points_per_sensor) for scan in whole] == counts
+    split = [scan.points_per_sensor for scan in in_memory(replace(FIXTURE, split=True)).scans]
+    assert sorted(split) == sorted(
+        pair for left, right in counts for pair in ((left, 0), (0, right))
+    )
