@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import contextlib
 import difflib
+from collections import Counter
 from collections.abc import Callable, Collection, Generator, Iterator, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, TypeAlias
@@ -21,7 +22,7 @@ from mlbatch import sensors
 from mlbatch.clocks.compare import COMPARABLE_NS
 from mlbatch.discovery.calibrations import MetadataCollector, subscribe
 from mlbatch.discovery.sampler import KindFilter, Sampler, split_by_kind
-from mlbatch.discovery.types import DetectedSensor, Note
+from mlbatch.discovery.types import DetectedSensor, Note, PacketKind
 from mlbatch.errors import RigError
 from mlbatch.native.capture import CaptureLoops
 from mlbatch.readers import has_packets, merge
@@ -39,7 +40,7 @@ ByLogTime: TypeAlias = Callable[[Recording], bool]
 FIRST_NS = 10 * NS_PER_S
 # Bytes of packets that are kept for the run: as many as it reads at a time.
 KEPT_BYTES = 8 << 20
-# Packets of a kind in a batch that are checked for being a lidar's.
+# Packets of a kind that are checked for being a lidar's.
 _CHECKED = 16
 # Clouds farther apart by their log times need more than different delays of their drivers.
 _CLOUDS_APART_NS = 150 * NS_PER_MS
@@ -104,18 +105,20 @@ class FirstSeconds:
         self, by_log_time: ByLogTime | None = None, seen: Seen | None = None
     ) -> Iterator[PacketBatch]:
         end_ns: int | None = None
-        kind_filter = KindFilter()
+        kind_filter, checked = KindFilter(), Counter[PacketKind]()
         with contextlib.closing(self._merged(by_log_time, seen)) as batches:
             for batch in batches:
+                row = 0
                 if end_ns is None:
-                    begin_ns = _first_lidar_host_ns(batch, kind_filter)
-                    end_ns = None if begin_ns is None else begin_ns + FIRST_NS
-                if end_ns is None:
-                    yield batch
-                    continue
-                later = np.flatnonzero(batch.host_ns > end_ns)
+                    first = _first_of_lidar(batch, kind_filter, checked)
+                    if first is None:
+                        yield batch
+                        continue
+                    row, end_ns = first, int(batch.host_ns[first]) + FIRST_NS
+                later = np.flatnonzero(batch.host_ns[row:] > end_ns)
                 if len(later):
-                    yield replace(batch.take(slice(0, int(later[0]))), messages=batch.messages)
+                    taken = batch.take(slice(0, row + int(later[0])))
+                    yield replace(taken, messages=batch.messages)
                     return
                 yield batch
         self._is_all = True
@@ -208,19 +211,24 @@ class FirstSeconds:
         )
 
 
-def _first_lidar_host_ns(batch: PacketBatch, kind_filter: KindFilter) -> int | None:
-    """Receive time of the first packet of a kind that is described as a lidar's.
+def _first_of_lidar(
+    batch: PacketBatch, kind_filter: KindFilter, checked: Counter[PacketKind]
+) -> int | None:
+    """Row of the first packet that is described as a lidar's, whatever the batches; None: none.
 
-    Several packets are checked: device packets may come first on the same topic.
+    Several packets of a kind are checked: device packets may come first on the same topic. checked:
+    how many so far.
     """
-    begins_ns = []
+    rows = []
     for kind, index in kind_filter.followed(batch, split_by_kind(batch)):
-        begins = batch.start[index[:_CHECKED]].tolist()
-        checked = np.stack([batch.data[begin : begin + kind.size] for begin in begins])
-        text = sensors.describe(kind.size, checked)
-        if text is not None and "lidar" in text:
-            begins_ns.append(int(batch.host_ns[index[0]]))
-    return min(begins_ns, default=None)
+        for row in index[: _CHECKED - checked[kind]].tolist():
+            checked[kind] += 1
+            begin = int(batch.start[row])
+            text = sensors.describe(kind.size, batch.data[None, begin : begin + kind.size])
+            if text is not None and "lidar" in text:
+                rows.append(row)
+                break
+    return min(rows, default=None)
 
 
 # -- decoded clouds --------------------------------------------------------------------------------
