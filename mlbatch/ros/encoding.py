@@ -8,7 +8,7 @@ NUL. ROS 1: packed, no head, no NUL (docs/sources/messages.md, section 4).
 from __future__ import annotations
 
 import struct
-from typing import Protocol, TypeAlias
+from typing import TypeAlias
 
 from mlbatch.errors import RecordingError
 from mlbatch.ros.definitions import PRIMITIVES, SEQUENCE, Definitions, Field
@@ -224,66 +224,29 @@ class MessageReader(Cursor):
 # -- writing --------------------------------------------------------------------------------------
 
 
-class Wire(Protocol):
-    """A message under construction."""
+class Wire:
+    """A message under construction; encoding: one of ENCODINGS."""
 
-    data: bytearray
-
-    def put(self, code: str, *values: float) -> None:
-        """Append values of one type, `code` as in `struct`."""
-        ...
-
-    def text(self, value: str) -> None:
-        """Append a string."""
-        ...
-
-    def header(self, stamp_ns: int, frame_id: str) -> None:
-        """Append a std_msgs/Header."""
-        ...
-
-
-class Cdr:
-    """A message of ROS 2 under construction."""
-
-    def __init__(self) -> None:
-        self.data = bytearray(_CDR_HEAD)
+    def __init__(self, encoding: str = "cdr") -> None:
+        self._is_cdr = encoding == "cdr"
+        self.data = bytearray(_CDR_HEAD if self._is_cdr else b"")
 
     def put(self, code: str, *values: float) -> None:
         """Append values of one type, `code` as in `struct`."""
-        size = struct.calcsize(code)
-        self.data += bytes((len(_CDR_HEAD) - len(self.data)) % size)
+        if self._is_cdr:
+            self.data += bytes((len(_CDR_HEAD) - len(self.data)) % struct.calcsize(code))
         self.data += struct.pack(f"<{len(values)}{code}", *values)
 
     def text(self, value: str) -> None:
-        """Append a string: length with the closing NUL, bytes, NUL."""
-        data = value.encode() + b"\x00"
+        """Append a string: length, bytes, and in CDR a NUL that the length counts."""
+        data = value.encode() + b"\x00" * self._is_cdr
         self.put("I", len(data))
         self.data += data
 
     def header(self, stamp_ns: int, frame_id: str) -> None:
-        """Append a std_msgs/Header."""
+        """Append a std_msgs/Header; in ROS 1 of number 0, since a publisher would set it."""
+        if not self._is_cdr:
+            self.put("I", 0)
         self.put("i", stamp_ns // NS_PER_S)
         self.put("I", stamp_ns % NS_PER_S)
-        self.text(frame_id)
-
-
-class Ros1:
-    """A message of ROS 1 under construction."""
-
-    def __init__(self) -> None:
-        self.data = bytearray()
-
-    def put(self, code: str, *values: float) -> None:
-        """Append values of one type, `code` as in `struct`."""
-        self.data += struct.pack(f"<{len(values)}{code}", *values)
-
-    def text(self, value: str) -> None:
-        """Append a string: length, bytes."""
-        data = value.encode()
-        self.put("I", len(data))
-        self.data += data
-
-    def header(self, stamp_ns: int, frame_id: str) -> None:
-        """Append a std_msgs/Header; sequence number 0, since a publisher would set it."""
-        self.put("I", 0, stamp_ns // NS_PER_S, stamp_ns % NS_PER_S)
         self.text(frame_id)

@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from typing import NamedTuple
 
 from mlbatch.ros.definitions import PRIMITIVES, SEQUENCE, Field, definitions_of, type_key
-from mlbatch.ros.encoding import Cdr, Ros1, Wire
+from mlbatch.ros.encoding import Wire
 from mlbatch.ros.packet_types import PACKET_TYPES, PADDED
 from mlbatch.types import Message, Topic
 from mlbatch.units import NS_PER_S
@@ -82,7 +82,7 @@ class PacketMessages:
         """
         if not self._waiting:
             return
-        wire: Wire = Cdr() if self.topic.encoding == "cdr" else Ros1()
+        wire = Wire(self.topic.encoding)
         packets = self._waiting
         self._waiting = []
         if self._envelope.inside:

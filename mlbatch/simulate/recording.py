@@ -19,7 +19,7 @@ import numpy as np
 from mlbatch.arrays import F64Array
 from mlbatch.errors import UsageError
 from mlbatch.frames.transforms import quaternion, rpy_deg
-from mlbatch.ros.encoding import Cdr
+from mlbatch.ros.encoding import Wire
 from mlbatch.ros.packet_writing import PacketMessages, Stamped
 from mlbatch.simulate.lidar_stream import LidarStream, Received, SensorClock, with_errors
 from mlbatch.simulate.scenario import Scenario
@@ -359,14 +359,14 @@ def _side_files(scenario: Scenario, streams: list[LidarStream], target: Path) ->
 
 def text_message(text: str) -> bytes:
     """Return a std_msgs/String."""
-    message = Cdr()
+    message = Wire()
     message.text(text)
     return bytes(message.data)
 
 
 def imu_message(stamp_ns: int, frame: str, force: Sequence[float], rate: Sequence[float]) -> bytes:
     """Return a sensor_msgs/Imu: m/s2 and rad/s, frame of the IMU, without orientation."""
-    message = Cdr()
+    message = Wire()
     message.header(stamp_ns, frame)
     message.put("d", 0.0, 0.0, 0.0, 1.0, *_UNKNOWN)
     message.put("d", *rate, *(0.0,) * 9)
@@ -378,7 +378,7 @@ def transform_message(
     stamp_ns: int, parent: str, child: str, place_m: F64Array, rotation: F64Array
 ) -> bytes:
     """Return a tf2_msgs/TFMessage of a pose: (3,) and (3, 3)."""
-    message = Cdr()
+    message = Wire()
     message.put("I", 1)
     message.header(stamp_ns, parent)
     message.text(child)
@@ -389,7 +389,7 @@ def transform_message(
 
 def odometry_message(stamp_ns: int, parent: str, child: str, poses: Poses, row: int) -> bytes:
     """Return a nav_msgs/Odometry of the pose of the body; twist in the frame of the body."""
-    message = Cdr()
+    message = Wire()
     message.header(stamp_ns, parent)
     message.text(child)
     message.put("d", *poses.position_m[row].tolist())

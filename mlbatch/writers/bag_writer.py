@@ -13,7 +13,7 @@ from fractions import Fraction
 from pathlib import Path
 from typing import NamedTuple
 
-from mlbatch.ros.encoding import Cdr
+from mlbatch.ros.encoding import Wire
 from mlbatch.types import Message, RunInfo, Scan, Summary, Topic
 from mlbatch.writers.bag_metadata import METADATA, metadata_text, read_file
 from mlbatch.writers.base import FileSet, ScanJob, WriterOptions, windows_per_file
@@ -66,7 +66,7 @@ class BagWriter(MessageWriter):
             return McapContainer(path, options.compression, check_topic)
 
         def begin_file(container: McapContainer, log_ns: int) -> None:
-            transforms = static_transforms(info, log_ns, Cdr)
+            transforms = static_transforms(info, log_ns, Wire)
             container.send(TF_STATIC, TF_TYPE, log_ns, transforms, latched=True)
 
         def end_file(container: McapContainer) -> int:
@@ -79,7 +79,7 @@ class BagWriter(MessageWriter):
             self._bag = BagFiles(folder, target.name, windows, stages, options.files)
             return self._bag
 
-        super().__init__(target, info, options, Cdr, open_files, folder=True)
+        super().__init__(target, info, options, Wire, open_files, folder=True)
 
     def skip(self, scan: Scan, sensor: int | None = None) -> ScanJob:
         """Return the job of a scan in a file of another run: it has a place, and no message."""

@@ -13,7 +13,7 @@ from mcap.reader import make_reader
 from rosbags import rosbag1
 
 from mlbatch.errors import ExportError
-from mlbatch.ros.encoding import Cdr
+from mlbatch.ros.encoding import Wire
 from mlbatch.types import IMU, PACKED_ROOM, Message, PackedPoints, Summary, Topic
 from mlbatch.writers import extras, open_writer, plugin, report_paths
 from mlbatch.writers.base import WriterOptions
@@ -245,7 +245,7 @@ def test_packed_points_become_the_message_of_arrays(frame: str) -> None:
     buffer = np.zeros(end + 1, np.uint8)
     layout.pack(scan, buffer[PACKED_ROOM:end].view(layout.dtype))
     packed = PackedPoints(buffer, PACKED_ROOM, end, (scan.points,))
-    cloud = CloudMessage(layout, frame, Cdr)
+    cloud = CloudMessage(layout, frame, Wire)
     from_arrays = cloud.message(scan, 5, True).tobytes()
     assert cloud.message(replace(scan, packed=packed), 5, True).tobytes() == from_arrays
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 from functools import partial
 from pathlib import Path
 
-from mlbatch.ros.encoding import Cdr
+from mlbatch.ros.encoding import Wire
 from mlbatch.types import RunInfo
 from mlbatch.writers.base import ScanWriter, WriterOptions
 from mlbatch.writers.message_writer import MessageFile, MessageWriter, extras_of, record_of
@@ -29,4 +29,4 @@ def open_writer(target: Path, info: RunInfo, options: WriterOptions) -> ScanWrit
 
         return McapContainer(path, options.compression)
 
-    return MessageWriter(target, info, options, Cdr, open_file)
+    return MessageWriter(target, info, options, Wire, open_file)

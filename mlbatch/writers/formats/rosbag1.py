@@ -9,7 +9,7 @@ from __future__ import annotations
 from functools import partial
 from pathlib import Path
 
-from mlbatch.ros.encoding import Ros1
+from mlbatch.ros.encoding import Wire
 from mlbatch.types import RunInfo
 from mlbatch.writers.base import ScanWriter, WriterOptions
 from mlbatch.writers.message_writer import MessageWriter, extras_of, record_of
@@ -24,4 +24,4 @@ record_layout = record_of
 
 def open_writer(target: Path, info: RunInfo, options: WriterOptions) -> ScanWriter:
     """Start a ROS 1 bag."""
-    return MessageWriter(target, info, options, Ros1, Rosbag1Container)
+    return MessageWriter(target, info, options, partial(Wire, "ros1"), Rosbag1Container)

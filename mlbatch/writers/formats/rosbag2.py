@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from mlbatch.errors import ExportError
-from mlbatch.ros.encoding import Cdr
+from mlbatch.ros.encoding import Wire
 from mlbatch.types import RunInfo, Topic
 from mlbatch.writers.bag_metadata import METADATA, file_of_container, metadata_text
 from mlbatch.writers.base import ScanWriter, WriterOptions
@@ -45,7 +45,7 @@ def open_writer(target: Path, info: RunInfo, options: WriterOptions) -> ScanWrit
 
         return McapContainer(path, options.compression, check_topic, write_metadata)
 
-    return MessageWriter(target, info, options, Cdr, open_file, folder=True)
+    return MessageWriter(target, info, options, Wire, open_file, folder=True)
 
 
 def check_topic(topic: Topic) -> None:
