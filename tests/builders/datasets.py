@@ -1,15 +1,12 @@
 """Small look-alikes of public datasets, from the layouts that their pages publish.
 
-Written by the libraries `rosbags` and numpy alone: nothing here is shared with the builders of the
-readers' tests, or with the package. Every lidar measures one place, (1, 0, 0) in its own frame,
-from START_NS on: sweeps of 100 ms with a column each ms. So its points in the body are
-R (1, 0, 0) + t, by hand, at known times.
+Every lidar measures one place, (1, 0, 0) in its own frame, from START_NS on: sweeps of 100 ms with
+a column each ms. So its points in the body are R (1, 0, 0) + t, by hand, at known times.
 """
 
 from __future__ import annotations
 
 import gzip
-import inspect
 import json
 from collections.abc import Callable, Mapping, Sequence
 from datetime import datetime, timezone
@@ -17,9 +14,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from rosbags.rosbag1 import Writer as Writer1
-from rosbags.rosbag2 import Writer as Writer2
-from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+from tests.builders.bags import Body, Recorded, transforms_message
+from tests.builders.points import CLOUD, CUSTOM, Form, cloud_of, custom_message
+from tests.builders.rosbag1 import write_rosbag1
+from tests.builders.rosbag2 import write_folder
+from tests.builders.sweeps import pcd
 
 MS = 1_000_000
 START_NS = 1_700_000_000_000_000_000
@@ -31,28 +31,10 @@ LAST = (COLUMNS - 1) * MS
 # Half of a right angle: the quaternion of a quarter about z is (0, 0, H, H).
 H = 0.7071067811865476
 
-# By the repositories ros-drivers/velodyne, Livox-SDK/livox_ros_driver, ros/geometry2.
-_DEFINITIONS = {
-    "velodyne_msgs/msg/VelodynePacket": "time stamp\nuint8[1206] data\n",
-    "velodyne_msgs/msg/VelodyneScan": "std_msgs/Header header\nVelodynePacket[] packets\n",
-    "livox_ros_driver/msg/CustomPoint": "uint32 offset_time\nfloat32 x\nfloat32 y\nfloat32 z\n"
-    "uint8 reflectivity\nuint8 tag\nuint8 line\n",
-    "tf2_msgs/msg/TFMessage": "geometry_msgs/TransformStamped[] transforms\n",
-    "livox_ros_driver/msg/CustomMsg": "std_msgs/Header header\nuint64 timebase\n"
-    "uint32 point_num\nuint8 lidar_id\nuint8[3] rsvd\nCustomPoint[] points\n",
-}
-ROS1 = get_typestore(Stores.ROS1_NOETIC)
-ROS2 = get_typestore(Stores.ROS2_HUMBLE)
-for _store in (ROS1, ROS2):
-    for _name, _text in _DEFINITIONS.items():
-        _store.register(get_types_from_msg(_text, _name))
-
-# Messages of a topic: type, and log time with the message.
-Topic = tuple[str, str, list[tuple[int, Any]]]
 Times = Callable[[Any, int], Any]
+# The messages of a topic.
+Topic = list[Recorded]
 
-# sensor_msgs/PointField.
-_DATATYPES = {"i1": 1, "u1": 2, "i2": 3, "u2": 4, "i4": 5, "u4": 6, "f4": 7, "f8": 8}
 XYZI = {"x": "f4", "y": "f4", "z": "f4", "intensity": "f4"}
 OUSTER = {**XYZI, "t": "u4", "reflectivity": "u2", "ring": "u2", "ambient": "u2"}
 # The types that the manuals of NTU VIRAL and MCD publish.
@@ -92,46 +74,6 @@ def starts(of: int = SWEEPS) -> list[int]:
     return [START_NS + number * SWEEP for number in range(of)]
 
 
-def _make(store: Any, kind: str, /, **fields: Any) -> Any:
-    return store.types[kind](**fields)
-
-
-def _header(store: Any, stamp_ns: int, frame: str) -> Any:
-    seconds, rest = divmod(stamp_ns, 10**9)
-    stamp = _make(store, "builtin_interfaces/msg/Time", sec=seconds, nanosec=rest)
-    seq = {"seq": 0} if store is ROS1 else {}
-    return _make(store, "std_msgs/msg/Header", stamp=stamp, frame_id=frame, **seq)
-
-
-def cloud(points: Any, stamp_ns: int, frame: str = "") -> Any:
-    """A PointCloud2 of a structured array."""
-    fields = [
-        _make(
-            ROS1,
-            "sensor_msgs/msg/PointField",
-            name=name,
-            offset=offset,
-            count=1,
-            datatype=_DATATYPES[dtype.str[1:]],
-        )
-        for name, (dtype, offset, *_) in points.dtype.fields.items()
-    ]
-    data = np.frombuffer(points.tobytes(), np.uint8)
-    return _make(
-        ROS1,
-        "sensor_msgs/msg/PointCloud2",
-        header=_header(ROS1, stamp_ns, frame),
-        height=1,
-        width=len(points),
-        fields=fields,
-        is_bigendian=False,
-        point_step=points.dtype.itemsize,
-        row_step=len(data),
-        data=data,
-        is_dense=True,
-    )
-
-
 def clouds(
     topic: str,
     fields: Mapping[str, str],
@@ -142,52 +84,30 @@ def clouds(
     clock_ns: int = 0,
 ) -> Topic:
     """Clouds of a topic; header_ns: after the start of the sweep; clock_ns: minus the true time."""
-    messages = [
-        (
+    form = Form("ros1", frame)
+    return [
+        Recorded(
+            topic,
+            CLOUD,
             start + SWEEP,
-            cloud(rows(fields, time, start + clock_ns), start + header_ns + clock_ns, frame),
+            cloud_of(rows(fields, time, start + clock_ns), start + header_ns + clock_ns, form),
         )
         for start in starts()
     ]
-    return topic, "sensor_msgs/msg/PointCloud2", messages
 
 
 def customs(topic: str, clock_ns: int = 0) -> Topic:
     """Livox CustomMsg: ns after the start."""
-    messages = []
-    for start in starts():
-        points = [
-            _make(
-                ROS1,
-                "livox_ros_driver/msg/CustomPoint",
-                offset_time=column * MS,
-                x=1.0,
-                y=0.0,
-                z=0.0,
-                reflectivity=9,
-                tag=0,
-                line=line,
-            )
-            for column in range(COLUMNS)
-            for line in range(RINGS)
-        ]
-        stamp_ns = start + clock_ns
-        messages.append(
-            (
-                start + SWEEP,
-                _make(
-                    ROS1,
-                    "livox_ros_driver/msg/CustomMsg",
-                    header=_header(ROS1, stamp_ns, ""),
-                    timebase=stamp_ns,
-                    point_num=len(points),
-                    lidar_id=0,
-                    rsvd=np.zeros(3, np.uint8),
-                    points=points,
-                ),
-            )
+    points = [(n * MS, 1.0, 0.0, 0.0, 9, 0, ring) for n in range(COLUMNS) for ring in range(RINGS)]
+    return [
+        Recorded(
+            topic,
+            CUSTOM,
+            start + SWEEP,
+            custom_message(points, start + clock_ns, start + clock_ns, "ros1"),
         )
-    return topic, "livox_ros_driver/msg/CustomMsg", messages
+        for start in starts()
+    ]
 
 
 # A VelodyneScan of so many packets, about a sixth of a revolution.
@@ -207,102 +127,54 @@ _PACKET = np.dtype(
 )
 
 
-def scans(topic: str, model: str, frame: str, store: Any = ROS1) -> Topic:
+def scans(topic: str, model: str, frame: str, encoding: str = "ros1") -> Topic:
     """Raw packets of a Velodyne at 10 Hz, all ranges alike."""
     product, packet_us = PRODUCTS[model]
     # VLS-128: four blocks of 32 beams fire at one azimuth, with flags of their own.
-    flags = [0xEEFF, 0xDDFF, 0xCCFF, 0xBBFF] * 3 if model == "VLS-128" else [0xEEFF] * 12
+    at_once = 4 if model == "VLS-128" else 1
     messages = []
     for number in range(SCANS):
         packets = []
         for index in range(number * SCAN_PACKETS, (number + 1) * SCAN_PACKETS):
             packet = np.zeros((), _PACKET)
             at_us = index * packet_us
-            step_us = packet_us / 12
-            fired = np.arange(12) // (4 if model == "VLS-128" else 1)
-            first_us = at_us + fired * (step_us * (4 if model == "VLS-128" else 1))
-            packet["blocks"]["flag"] = flags
+            first_us = at_us + np.arange(12) // at_once * (packet_us / 12 * at_once)
+            packet["blocks"]["flag"] = ([0xEEFF, 0xDDFF, 0xCCFF, 0xBBFF][:at_once] * 12)[:12]
             packet["blocks"]["azimuth"] = (first_us / 1e5 * 36000).astype(int) % 36000
             packet["blocks"]["readings"]["range"] = 2000
             packet["blocks"]["readings"]["level"] = 50
             packet["us"] = int(START_NS % HOUR_NS / 1000 + at_us)
             packet["factory"] = (0x37, product)
-            seconds, rest = divmod(START_NS + round((at_us + packet_us) * 1000), 10**9)
-            packets.append(
-                _make(
-                    store,
-                    "velodyne_msgs/msg/VelodynePacket",
-                    stamp=_make(store, "builtin_interfaces/msg/Time", sec=seconds, nanosec=rest),
-                    data=np.frombuffer(packet.tobytes(), np.uint8),
-                )
-            )
-        last_ns = seconds * 10**9 + rest
-        messages.append(
-            (
-                last_ns + MS,
-                _make(
-                    store,
-                    "velodyne_msgs/msg/VelodyneScan",
-                    header=_header(store, last_ns, frame),
-                    packets=packets,
-                ),
-            )
-        )
-    return topic, "velodyne_msgs/msg/VelodyneScan", messages
+            packets.append((START_NS + round((at_us + packet_us) * 1000), packet.tobytes()))
+        last_ns = packets[-1][0]
+        body = Body(encoding).header(last_ns, frame).put("I", len(packets))
+        for stamp_ns, data in packets:
+            body.time(stamp_ns).raw(data)
+        scan = "velodyne_msgs/VelodyneScan"
+        messages.append(Recorded(topic, scan, last_ns + MS, body.done()))
+    return messages
 
 
-def transforms(edges: Sequence[tuple[str, str, tuple[float, ...], tuple[float, ...]]]) -> Topic:
+def transforms(edges: Sequence[tuple[str, str, Sequence[float], Sequence[float]]]) -> Topic:
     """/tf_static: parent, child, translation and quaternion of each."""
-    found = []
-    for parent, child, origin, xyzw in edges:
-        moved = _make(
-            ROS1,
-            "geometry_msgs/msg/Transform",
-            translation=_make(
-                ROS1, "geometry_msgs/msg/Vector3", **dict(zip("xyz", origin, strict=True))
-            ),
-            rotation=_make(
-                ROS1, "geometry_msgs/msg/Quaternion", **dict(zip("xyzw", xyzw, strict=True))
-            ),
-        )
-        found.append(
-            _make(
-                ROS1,
-                "geometry_msgs/msg/TransformStamped",
-                transform=moved,
-                header=_header(ROS1, START_NS, parent),
-                child_frame_id=child,
-            )
-        )
-    message = _make(ROS1, "tf2_msgs/msg/TFMessage", transforms=found)
-    return "/tf_static", "tf2_msgs/msg/TFMessage", [(START_NS, message)]
+    data = transforms_message("ros1", edges)
+    return [Recorded("/tf_static", "tf2_msgs/TFMessage", START_NS, data, latched=True)]
+
+
+def _in_order(topics: Sequence[Topic]) -> list[Recorded]:
+    """The messages of topics by log time."""
+    return sorted((one for topic in topics for one in topic), key=lambda one: one.log_ns)
 
 
 def bag(name: str, *topics: Topic) -> None:
-    """A ROS 1 bag in the order of log times."""
+    """A ROS 1 bag."""
     Path(name).parent.mkdir(parents=True, exist_ok=True)
-    with Writer1(Path(name)) as writer:
-        messages = [
-            (log_ns, number, writer_topic, kind, message)
-            for number, ((topic, kind, some), writer_topic) in enumerate(
-                (one, writer.add_connection(one[0], one[1], typestore=ROS1)) for one in topics
-            )
-            for log_ns, message in some
-        ]
-        for log_ns, _, connection, kind, message in sorted(messages, key=lambda one: one[:2]):
-            writer.write(connection, log_ns, ROS1.serialize_ros1(message, kind))
+    write_rosbag1(Path(name), _in_order(topics))
 
 
 def folder(name: str, *topics: Topic) -> None:
-    """A ROS 2 bag in the order of log times."""
-    # SQLite in all; rosbags before 0.10 asks for no version.
-    has_versions = "version" in inspect.signature(Writer2).parameters
-    options: dict[str, Any] = {"version": 9} if has_versions else {}
-    with Writer2(Path(name), **options) as writer:
-        known = {one[0]: writer.add_connection(one[0], one[1], typestore=ROS2) for one in topics}
-        messages = [(log, topic, kind, one) for topic, kind, some in topics for log, one in some]
-        for log_ns, topic, kind, message in sorted(messages, key=lambda one: one[:2]):
-            writer.write(known[topic], log_ns, ROS2.serialize_cdr(message, kind))
+    """A ROS 2 bag."""
+    write_folder(Path(name), [_in_order(topics)])
 
 
 def text(name: str, content: str) -> None:
@@ -338,26 +210,6 @@ def files(folder: str, name: Callable[[int], str], data: Callable[[int], bytes])
         (Path(folder) / name(start)).write_bytes(data(start))
 
 
-def pcd(points: Any) -> bytes:
-    """A binary PCD file."""
-    kinds = [points.dtype[name] for name in points.dtype.names]
-    lines = (
-        "# .PCD v0.7 - Point Cloud Data file format",
-        "VERSION 0.7",
-        "FIELDS " + " ".join(points.dtype.names),
-        "SIZE " + " ".join(str(kind.itemsize) for kind in kinds),
-        "TYPE " + " ".join(kind.kind.upper() for kind in kinds),
-        "COUNT " + " ".join("1" for _ in kinds),
-        f"WIDTH {len(points)}",
-        "HEIGHT 1",
-        "VIEWPOINT 0 0 0 1 0 0 0",
-        f"POINTS {len(points)}",
-        "DATA binary",
-    )
-    data: bytes = points.tobytes()
-    return ("\n".join(lines) + "\n").encode() + data
-
-
 # -- datasets -------------------------------------------------------------------------------------
 
 
@@ -367,7 +219,7 @@ def autoware() -> None:
     folder(
         "sample-rosbag",
         *(
-            scans(f"/sensing/lidar/{place}/velodyne_packets", model, f"velodyne_{place}", ROS2)
+            scans(f"/sensing/lidar/{place}/velodyne_packets", model, f"velodyne_{place}", "cdr")
             for place, model in models
         ),
     )
@@ -467,8 +319,7 @@ def hilti_2021() -> None:
 
 def other(topic: str) -> Topic:
     """A topic of another sensor."""
-    message = _make(ROS1, "std_msgs/msg/String", data="")
-    return topic, "std_msgs/msg/String", [(START_NS, message)]
+    return [Recorded(topic, "std_msgs/String", START_NS, Body("ros1").text("").done())]
 
 
 def hilti_2022(name: str = "exp14_basement_2.bag") -> None:
@@ -676,10 +527,11 @@ TRUCK = (
 
 
 def _truck(name: str) -> None:
+    fields = {**XYZI, "timestamp": "u8"}
     files(
         f"man-truckscenes/sweeps/{name}",
         lambda start: f"{name}_{start // 1000}.pcd",
-        lambda start: pcd(rows({**XYZI, "timestamp": "u8"}, since_1970_us, start)),
+        lambda start: pcd(fields, rows(fields, since_1970_us, start).tolist()),
     )
 
 
@@ -726,7 +578,8 @@ def complex_urban() -> None:
 
 def nuplan() -> None:
     """PCD files of merged lidars, without times."""
-    data = pcd(rows({**XYZI, "ring": "f4", "lidar_info": "f4"}, after_start_s))
+    fields = {**XYZI, "ring": "f4", "lidar_info": "f4"}
+    data = pcd(fields, rows(fields, after_start_s).tolist())
     files(
         "sensor_blobs/MergedPointCloud", lambda start: f"{start // 1000:016x}.pcd", lambda _: data
     )

@@ -7,8 +7,11 @@ package.
 from __future__ import annotations
 
 import struct
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
+
+import numpy.typing as npt
 
 from mlbatch.arrays import U8Array
 from tests.builders.bags import Body, Recorded
@@ -79,16 +82,39 @@ def cloud_message(
         + bytes(form.row_gap)
         for row in range(form.height)
     ]
-    body = Body(form.encoding).header(stamp_ns, form.frame)
-    body.put("I", form.height, width if form.width is None else form.width, len(fields))
+    places = []
     offset = 0
     for name, kind in fields:
-        body.text(name).put("I", offset).put("B", TYPES[kind][0]).put("I", form.count)
+        places.append((name, offset, kind))
         offset += struct.calcsize(TYPES[kind][1])
+    return _cloud(places, width, step, b"".join(rows), stamp_ns, form)
+
+
+def cloud_of(points: npt.NDArray[Any], stamp_ns: int, form: Form | None = None) -> bytes:
+    """A sensor_msgs/PointCloud2 of a structured array."""
+    kinds: Mapping[str, Any] = points.dtype.fields or {}
+    places = [(name, offset, kind.name) for name, (kind, offset, *_) in kinds.items()]
+    step = points.dtype.itemsize
+    return _cloud(places, len(points), step, points.tobytes(), stamp_ns, form or Form())
+
+
+def _cloud(
+    places: Sequence[tuple[str, int, str]],
+    width: int,
+    step: int,
+    data: bytes,
+    stamp_ns: int,
+    form: Form,
+) -> bytes:
+    """Fields by name, offset and type, and rows of points of `step` bytes."""
+    body = Body(form.encoding).header(stamp_ns, form.frame)
+    body.put("I", form.height, width if form.width is None else form.width, len(places))
+    for name, offset, kind in places:
+        body.text(name).put("I", offset).put("B", TYPES[kind][0]).put("I", form.count)
     body.put("B", form.bigendian)
     body.put("I", step if form.point_step is None else form.point_step)
     body.put("I", step * width + form.row_gap if form.row_step is None else form.row_step)
-    return body.blob(b"".join(rows)).put("B", 1).done()
+    return body.blob(data).put("B", 1).done()
 
 
 def custom_message(

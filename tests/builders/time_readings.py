@@ -2,21 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 import mlbatch
 from mlbatch.arrays import F64Array, I64Array
 from mlbatch.simulate.recording import write_recording
 from mlbatch.simulate.scenario import read_scenario
-from tests.builders.bags import Body, Recorded
+from tests.builders.bags import Recorded
 from tests.builders.mcaps import write_mcap
-from tests.builders.points import CLOUD, TYPES
+from tests.builders.points import CLOUD, Form, cloud_of
 
 SWEEP_NS = 100_000_000
 # From the last point of a sweep to its log time.
@@ -185,23 +183,11 @@ def _cloud(
     header_ns = start_ns if reading.header == "start" else last_ns
     zero_ns = {"start": start_ns, "to_end": last_ns, "age": last_ns}[reading.counts]
     after_ns = stamp_ns - zero_ns if reading.counts != "age" else zero_ns - stamp_ns
-    fields: Mapping[str, str] = {axis: "float32" for axis in "xyz"} | {"t": reading.kind}
-    dtype = np.dtype([(name, f"<{_code(kind)}") for name, kind in fields.items()])
-    rows: npt.NDArray[Any] = np.zeros(len(stamp_ns), dtype)
+    rows = np.zeros(len(stamp_ns), [*((axis, "f4") for axis in "xyz"), ("t", reading.kind)])
     for column, axis in enumerate("xyz"):
         rows[axis] = points_m[:, column]
     rows["t"] = after_ns / reading.unit_ns if reading.unit_ns > 1 else after_ns
-    body = Body("cdr").header(header_ns + reading.delay_ns, frame)
-    body.put("I", 1, len(rows), len(fields))
-    for name, kind in fields.items():
-        offset = dtype.fields[name][1]  # type: ignore[index]
-        body.text(name).put("I", int(offset)).put("B", TYPES[kind][0]).put("I", 1)
-    body.put("B", False).put("I", dtype.itemsize).put("I", dtype.itemsize * len(rows))
-    return body.blob(rows.tobytes()).put("B", 1).done()
-
-
-def _code(kind: str) -> str:
-    return {"float32": "f4", "uint32": "u4", "int32": "i4"}[kind]
+    return cloud_of(rows, header_ns + reading.delay_ns, Form(frame=frame))
 
 
 def _rig(poses: Sequence[F64Array], readings: Sequence[Reading]) -> str:

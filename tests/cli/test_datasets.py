@@ -24,6 +24,8 @@ from mlbatch.rig.recipes import FACTS, FOLDER, MARKS, UNKNOWN, recipe, recipe_na
 from mlbatch.rig.rig import read_rig
 from mlbatch.rig.yaml_tree import read_yaml
 from tests.builders import datasets as made
+from tests.builders.bags import Recorded
+from tests.builders.points import CLOUD, Form, cloud_of
 from tests.builders.run import Outcome
 from tests.builders.sessions import REPOSITORY, Shell, report_of
 from tests.builders.time_readings import SWEEP_NS, drive, scenario
@@ -326,8 +328,9 @@ def test_a_look_alike_that_moves_shows_how_its_times_are_read(shell: Shell, read
                 points[axis] = values
             points["t"] = stamp_ns - start_ns
             at_ns = start_ns + (SWEEP_NS if lidar == 0 else 0)
-            messages.append((start_ns + SWEEP_NS, made.cloud(points, at_ns)))
-        topics.append((topic, "sensor_msgs/msg/PointCloud2", messages))
+            data = cloud_of(points, at_ns, Form("ros1", ""))
+            messages.append(Recorded(topic, CLOUD, start_ns + SWEEP_NS, data))
+        topics.append(messages)
     made.bag("ntu_day_01/ntu_day_01.bag", *topics)
     lines = ["body:\n"]
     for name, pose in zip(("os_sensor", "livox"), moved.poses, strict=True):

@@ -10,13 +10,12 @@ import pytest
 
 from mlbatch.discovery.calibrations import find_calibrations
 from mlbatch.discovery.discover import Discovery, SensorSelection, discover
-from mlbatch.discovery.first_seconds import FirstSeconds, is_without_packets
+from mlbatch.discovery.first_seconds import FirstSeconds
 from mlbatch.discovery.match import describe
 from mlbatch.errors import RecordingError, RigError, UsageError
 from mlbatch.readers import open_recording
 from mlbatch.types import StreamTable
 from tests.builders.sessions import (
-    NS_PER_S,
     SMALL,
     Unit,
     twin,
@@ -32,22 +31,6 @@ def _discover(capture: Path, selection: SensorSelection | None = None) -> Discov
     return discover([open_recording(capture, table)], table, selection or SensorSelection())
 
 
-def test_the_first_seconds_are_ten(tmp_path: Path) -> None:
-    """From the first packet on, the packet at ten seconds included, over all recordings."""
-    one = Unit(turns=60)
-    late = replace(twin(one, 222), begin_ns=one.begin_ns + 5 * NS_PER_S, turns=60)
-    captures = [write_session(tmp_path / "1", one), write_session(tmp_path / "2", late)]
-    table = StreamTable()
-    recordings = [open_recording(path, table) for path in captures]
-    first = FirstSeconds(recordings, table)
-    read = first.again(is_without_packets, None)
-    host_ns = np.concatenate([batch.host_ns for batch in read])
-    assert host_ns[-1] - host_ns[0] <= 10 * NS_PER_S
-    # 32 packets a revolution of 0.1 s: 6 s of the first; of the second 5 s and the packet at 10 s.
-    sampler = first.sampler
-    assert [samples.packets for samples in sampler.kinds.values()] == [60 * 32, 50 * 32 + 1]
-
-
 def test_sensors_without_a_rig_are_named_after_their_serial_number(tmp_path: Path) -> None:
     capture = write_session(tmp_path, Unit(spec=replace(SMALL, extrinsic_m=POSE)))
     (sensor,) = _discover(capture).sensors
@@ -59,13 +42,6 @@ def test_sensors_without_a_serial_number_are_numbered(tmp_path: Path) -> None:
     old = replace(SMALL, profile="LEGACY", serial=0)
     capture = write_session(tmp_path, Unit(spec=old))
     assert [sensor.name for sensor in _discover(capture).sensors] == ["ouster_1"]
-
-
-@pytest.mark.parametrize(("posed", "frame"), [(False, "ouster_111"), (True, "base_link")])
-def test_the_frame_of_a_single_lidar(tmp_path: Path, posed: bool, frame: str) -> None:
-    """Without extrinsics its points stay in its own frame, and are called so."""
-    spec = replace(SMALL, extrinsic_m=POSE if posed else None)
-    assert _discover(write_session(tmp_path, Unit(spec=spec))).frame_id == frame
 
 
 def test_two_lidars_need_extrinsics_or_identity_on_request(tmp_path: Path) -> None:
@@ -80,17 +56,6 @@ def test_two_lidars_need_extrinsics_or_identity_on_request(tmp_path: Path) -> No
     assert [s.name for s in _discover(capture, SensorSelection(only=("222",))).sensors] == [
         "ouster_222"
     ]
-
-
-def test_the_extrinsics_of_the_rig_come_before_those_of_the_metadata(tmp_path: Path) -> None:
-    capture = write_session(tmp_path, Unit(spec=replace(SMALL, extrinsic_m=POSE)))
-    rig = tmp_path / "rig.yaml"
-    rig.write_text("sensors:\n- {name: top, extrinsics: {translation_m: [1, 2, 3]}}\n")
-    (sensor,) = _discover(capture, SensorSelection(rig=rig)).sensors
-    assert (sensor.pose.source, sensor.pose.body_from_sensor[:3, 3].tolist()) == ("rig", [1, 2, 3])
-    rig.write_text("sensors:\n- {name: top}\n")
-    (sensor,) = _discover(capture, SensorSelection(rig=rig)).sensors
-    assert sensor.pose.source == "metadata"
 
 
 def test_metadata_are_searched_in_the_folders_of_all_recordings(tmp_path: Path) -> None:

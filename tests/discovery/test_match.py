@@ -1,4 +1,4 @@
-"""Several lidars at one address are refused; damage of the packets of one lidar is not."""
+"""Captures of one lidar and of several: one address, two drives, copies."""
 
 from __future__ import annotations
 
@@ -19,25 +19,11 @@ from tests.matrix.lidars import NS_PER_MS, NS_PER_S, VENDORS, Sent, Spell, write
 
 BEGIN_NS = 1_700_000_000 * NS_PER_S
 LENGTH_NS = 1200 * NS_PER_MS
-# Time of a packet of each lidar of the matrix, ns: the sheets' column periods times columns.
-PACKET_NS = {
-    "ouster": 100 * NS_PER_MS // 512 * 16,
-    "velodyne": 24 * 55_296,
-    "hesai": 8 * 50_000,
-    "robosense": 24 * 55_552,
-}
 FILES = {"ouster": "front.json", "velodyne": "", "hesai": "unit.csv", "robosense": "angles.csv"}
 
 
 def one(vendor: str) -> Sent:
     return VENDORS[vendor].send(Spell(BEGIN_NS, LENGTH_NS))
-
-
-def both(vendor: str, ahead_ns: int, clock_ahead_ns: int = 0) -> Sent:
-    """Packets of two lidars in receive order; of the second, sending and clock are ahead."""
-    spell = Spell(BEGIN_NS + ahead_ns + clock_ahead_ns, LENGTH_NS, ahead_ns=-clock_ahead_ns)
-    mixed = one(vendor).then(VENDORS[vendor].send(spell))
-    return mixed.where(np.argsort(mixed.host_ns, kind="stable"))
 
 
 def captured(vendor: str, sent: Sent, path: Path) -> Path:
@@ -57,32 +43,9 @@ def told(vendor: str, folder: Path, verb: str, *captures: Path, words: str = "")
     return command(verb, *captures, *files, *words.split())
 
 
-def converted(vendor: str, sent: Sent, folder: Path) -> tuple[int, str]:
-    """Exit code and error of a conversion of these packets, all from one address."""
-    capture = captured(vendor, sent, folder / "drive.pcap")
-    result = told(vendor, folder, "convert", capture, words="--dry-run --quiet")
-    return result.code, result.err
-
-
-@pytest.mark.parametrize("share", [0.07, 0.3, 0.5, 0.81])
-@pytest.mark.parametrize("vendor", VENDORS)
-def test_two_lidars_that_alternate_are_refused(vendor: str, share: float, tmp_path: Path) -> None:
-    # A third of a revolution apart, so that the rotors differ as well.
-    ahead_ns = 33 * NS_PER_MS // PACKET_NS[vendor] * PACKET_NS[vendor]
-    code, err = converted(vendor, both(vendor, ahead_ns + int(share * PACKET_NS[vendor])), tmp_path)
-    assert code == 1
-    assert "several lidars share the address" in err
-
-
-@pytest.mark.parametrize("vendor", VENDORS)
-def test_two_clocks_are_refused(vendor: str, tmp_path: Path) -> None:
-    code, err = converted(vendor, both(vendor, 5 * NS_PER_MS, 700 * NS_PER_S), tmp_path)
-    assert code == 1
-    assert "several lidars share the address" in err
-
-
-def other_drive(sent: Sent, late_ns: int) -> Sent:
-    """Packets of the same timestamps and numbers with other readings."""
+def other_drive(vendor: str, late_ns: int, later_ns: int) -> Sent:
+    """Packets with other readings, received later, and with later timestamps."""
+    sent = VENDORS[vendor].send(Spell(BEGIN_NS + later_ns, LENGTH_NS, ahead_ns=-later_ns))
     middle = len(sent.payloads[0]) // 2
     payloads = tuple(
         one[:middle] + bytes(byte ^ 0x15 for byte in one[middle : middle + 2]) + one[middle + 2 :]
@@ -91,13 +54,17 @@ def other_drive(sent: Sent, late_ns: int) -> Sent:
     return replace(sent, payloads=payloads, host_ns=sent.host_ns + late_ns)
 
 
-@pytest.mark.parametrize("late_ms", [0, 30, 400])
+@pytest.mark.parametrize(
+    ("late_ns", "later_ns"),
+    [(0, 0), (30 * NS_PER_MS, 0), (400 * NS_PER_MS, 0), (0, 150 * NS_PER_MS), (0, 37_000)],
+)
 @pytest.mark.parametrize("vendor", VENDORS)
-def test_recordings_of_two_drives_are_refused(vendor: str, late_ms: int, tmp_path: Path) -> None:
+def test_recordings_of_two_drives_are_refused(
+    vendor: str, late_ns: int, later_ns: int, tmp_path: Path
+) -> None:
     """Sensors without a set clock count from the same start on every drive."""
     first = captured(vendor, one(vendor), tmp_path / "first.pcap")
-    drive = other_drive(one(vendor), late_ms * NS_PER_MS)
-    second = captured(vendor, drive, tmp_path / "second.pcap")
+    second = captured(vendor, other_drive(vendor, late_ns, later_ns), tmp_path / "second.pcap")
     for verb, words in (("convert", "--dry-run --quiet"), ("inspect", ""), ("inspect", "--whole")):
         done = told(vendor, tmp_path, verb, first, second, words=words)
         assert done.code == 1, done.out
@@ -124,11 +91,16 @@ def test_a_copy_of_a_recording_changes_nothing(vendor: str, late_ms: int, tmp_pa
     assert told(vendor, tmp_path, "inspect", first, second).code == 0
 
 
-def test_inspect_notes_it(tmp_path: Path) -> None:
-    converted("velodyne", both("velodyne", 600_000), tmp_path)
-    result = command("inspect", tmp_path / "drive.pcap")
-    assert result.code == 0
-    assert "several lidars share the address" in result.out
+def test_two_lidars_at_one_address_are_refused_and_noted(tmp_path: Path) -> None:
+    """All that are found: test_interleaved.py."""
+    other = VENDORS["velodyne"].send(Spell(BEGIN_NS + 600_000, LENGTH_NS))
+    mixed = one("velodyne").then(other)
+    mixed = mixed.where(np.argsort(mixed.host_ns, kind="stable"))
+    capture = captured("velodyne", mixed, tmp_path / "drive.pcap")
+    refused = command("convert", capture, "--dry-run")
+    assert (refused.code, "several lidars share the address" in refused.err) == (1, True)
+    noted = command("inspect", capture)
+    assert (noted.code, "several lidars share the address" in noted.out) == (0, True)
 
 
 def test_large_samples_are_replaced_by_descriptions(tmp_path: Path) -> None:

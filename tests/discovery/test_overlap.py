@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import gzip
-import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -211,42 +210,6 @@ def test_parts_of_one_lidar_are_at_most_a_day_apart(
             "found more; convert each alone, or correct the receive times (editcap -t SECONDS) "
             "(no_overlap)\n"
         )
-
-
-# Of the second drive: first timestamp and number of its first frame, after those of the first one.
-OTHER_DRIVES = {
-    "same times": (0, 0),
-    "same times, other numbers": (0, 100),
-    "half as late": (150 * NS_PER_MS, 0),
-    "half as late, numbers that fit": (150 * NS_PER_MS, 3),
-    "out of phase": (37_000, 0),
-}
-
-
-@pytest.mark.parametrize("name", OTHER_DRIVES)
-@pytest.mark.parametrize("pack", [_plain, _packed])
-def test_recordings_of_two_drives_are_refused(
-    shell: Shell, tmp_path: Path, name: str, pack: Pack
-) -> None:
-    later_ns, frames = OTHER_DRIVES[name]
-    drive = replace(ONE, turns=6)
-    other = replace(
-        drive,
-        begin_ns=drive.begin_ns + later_ns,
-        first_frame=drive.first_frame + frames,
-        range_mm=7000,
-    )
-    paths = [
-        pack(_capture(tmp_path / f"{name}.pcap", one.records, [one]))
-        for name, one in (("first", drive), ("second", other))
-    ]
-    for words in ("convert -o out --quiet", "inspect"):
-        done = shell(*words.split(), *paths)
-        assert (done.code, done.out) == (1, "")
-        assert re.fullmatch(
-            "mlbatch: error: .*expected.*found.*two drives.*convert each.*\n", done.err
-        )
-    assert not Path("out").exists()
 
 
 def test_an_end_before_the_second_recording_does_not_help(shell: Shell, tmp_path: Path) -> None:

@@ -190,45 +190,6 @@ def test_large_held_sets_do_not_overflow_the_arena() -> None:
     assert skipped == {"fragment": 6 * 60}
 
 
-def feed(seed: int) -> Records:
-    """Datagrams of few sources and identifications, damaged in every way a network can."""
-    pick = random.Random(seed)
-    frames: list[bytes] = []
-    for i in range(pick.randint(1, 25)):
-        source = f"10.0.0.{pick.randint(1, 2)}"
-        frames += fragments(i, pick.randint(1, 3), source, 1300 + i % 3)
-    for _ in range(pick.choice([0, 1, 3, 9])):
-        at, to = pick.randrange(len(frames)), pick.randrange(len(frames))
-        deed = pick.choice(["drop", "repeat", "move", "swap"])
-        if deed == "swap":
-            frames[at], frames[to] = frames[to], frames[at]
-        elif deed == "repeat":
-            frames.insert(to, frames[at])
-        elif len(frames) > 1:
-            taken = frames.pop(at)
-            if deed == "move":
-                frames.insert(min(to, len(frames)), taken)
-    # A third of the clocks step back between queues, another third is set back.
-    back_ns = pick.choice([1000, -3000, -2 * SECOND_NS])
-    steps_ns = [0, 1000, 1000, 1000, 300_000_000, back_ns]
-    host_ns, records = 1000 * SECOND_NS, []
-    for frame in frames:
-        records.append((host_ns, frame))
-        host_ns += pick.choice(steps_ns)
-    return records
-
-
-@settings(max_examples=400)
-@given(
-    seed=st.integers(0, 2**32),
-    buffer_bytes=st.sampled_from([100, 1000, 2000, 5000, 20_000, 100_000]),
-)
-def test_any_traffic_through_any_buffer_is_joined_by_the_rules(
-    seed: int, buffer_bytes: int
-) -> None:
-    seen_and_skipped(feed(seed), buffer_bytes)
-
-
 @settings(max_examples=300)
 @given(
     pieces=st.lists(

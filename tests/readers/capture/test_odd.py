@@ -88,16 +88,10 @@ SIX_FRAMES = {
 }
 
 
-@pytest.mark.parametrize("name", FRAMES)
-def test_packets_in_odd_frames_are_read(name: str) -> None:
-    link, frame = FRAMES[name]
-    assert found([whole(frame, link)]) == [[(5, "10.0.0.1 > port 7502", PAYLOAD)], {}]
-
-
-@pytest.mark.parametrize("name", SIX_FRAMES)
-def test_packets_of_ipv6_in_odd_frames_are_read(name: str) -> None:
-    link, frame = SIX_FRAMES[name]
-    assert found([whole(frame, link)]) == [[(5, "fe80::1 > port 7502", PAYLOAD)], {}]
+@pytest.mark.parametrize(("frames", "source"), [(FRAMES, "10.0.0.1"), (SIX_FRAMES, "fe80::1")])
+def test_packets_in_odd_frames_are_read(frames: dict[str, tuple[int, bytes]], source: str) -> None:
+    for name, (link, frame) in frames.items():
+        assert found([whole(frame, link)]) == [[(5, f"{source} > port 7502", PAYLOAD)], {}], name
 
 
 @pytest.mark.parametrize("name", FRAMES)
