@@ -22,6 +22,7 @@ from mcap.writer import IndexType
 from mlbatch.arrays import I64Array, U8Array
 from mlbatch.readers.byte_records import SLACK
 from mlbatch.readers.capture.recording import CaptureRecording
+from tests.builders import rosbag2
 from tests.builders.bags import OUSTER_ROS1, Recorded, packet_message
 from tests.builders.captures import (
     Interface,
@@ -32,10 +33,9 @@ from tests.builders.captures import (
     write_pcap,
     write_pcapng,
 )
-from tests.builders.mcaps import LZ4, Form, write_mcap
+from tests.builders.containers import Bag, database, mcap, rosbag1
+from tests.builders.mcaps import LZ4, Form
 from tests.builders.reading import open_bag, open_capture, read
-from tests.builders.rosbag1 import write_rosbag1
-from tests.builders.rosbag2 import write_rosbag2
 
 OUSTER = "ouster_sensor_msgs/PacketMsg"
 T0_NS = 1_700_000_000_000_000_000
@@ -59,49 +59,41 @@ def _frames(packets: Packets) -> list[tuple[int, bytes]]:
     return [(at_ns, udp_frame(payload)[0]) for at_ns, payload in packets]
 
 
-def _recorded(packets: Packets, kind: str, encoding: str) -> list[Recorded]:
-    return [
-        Recorded("/lidar_packets", kind, at_ns, packet_message(encoding, payload))
+def _pcap(folder: Path, packets: Packets, big_endian: bool = False) -> Path:
+    return write_pcap(folder / "a", _frames(packets), big_endian=big_endian)
+
+
+def _pcapng(folder: Path, packets: Packets, big_endian: bool = False) -> Path:
+    blocks = [Packet(frame, at_ns) for at_ns, frame in _frames(packets)]
+    return write_pcapng(folder / "a", [Section(blocks, [Interface()], big_endian=big_endian)])
+
+
+def _bag(folder: Path, packets: Packets, bag: Bag) -> Path:
+    kind = OUSTER if bag.encoding == "cdr" else OUSTER_ROS1
+    messages = [
+        Recorded("/lidar_packets", kind, at_ns, packet_message(bag.encoding, payload))
         for at_ns, payload in packets
     ]
+    return bag.write(folder, messages)
 
 
-def _pcap(path: Path, packets: Packets, big_endian: bool = False) -> None:
-    write_pcap(path, _frames(packets), big_endian=big_endian)
-
-
-def _pcapng(path: Path, packets: Packets, big_endian: bool = False) -> None:
-    blocks = [Packet(frame, at_ns) for at_ns, frame in _frames(packets)]
-    write_pcapng(path, [Section(blocks, [Interface()], big_endian=big_endian)])
-
-
-def _mcap(path: Path, packets: Packets, form: Form) -> None:
-    write_mcap(path, _recorded(packets, OUSTER, "cdr"), form)
-
-
-def _rosbag1(path: Path, packets: Packets, compression: str = "none") -> None:
-    write_rosbag1(path, _recorded(packets, OUSTER_ROS1, "ros1"), compression, chunk_bytes=700)
-
-
-def _rosbag2(path: Path, packets: Packets) -> None:
-    write_rosbag2(path, _recorded(packets, OUSTER, "cdr"))
-
-
+_NO_INDEX = Form(chunk_bytes=700, index=IndexType.NONE, repeat=False)
+BAGS = {
+    "MCAP": mcap(Form(chunk_bytes=700)),
+    "MCAP without chunks": mcap(Form(chunked=False)),
+    "MCAP, lz4": mcap(Form(compression=LZ4, chunk_bytes=700)),
+    "MCAP without index": mcap(_NO_INDEX),
+    "ROS 1 bag": rosbag1("none", chunk_bytes=700),
+    "ROS 1 bag, lz4": rosbag1("lz4", chunk_bytes=700),
+    "ROS 2 bag": database(rosbag2.Form()),
+}
 # Kinds of files, written of payloads at times in ns.
-FORMATS: Mapping[str, Callable[[Path, Packets], object]] = {
+FORMATS: Mapping[str, Callable[[Path, Packets], Path]] = {
     "pcap": _pcap,
     "pcap, big endian": partial(_pcap, big_endian=True),
     "pcapng": _pcapng,
     "pcapng, big endian": partial(_pcapng, big_endian=True),
-    "MCAP": partial(_mcap, form=Form(chunk_bytes=700)),
-    "MCAP without chunks": partial(_mcap, form=Form(chunked=False)),
-    "MCAP, lz4": partial(_mcap, form=Form(compression=LZ4, chunk_bytes=700)),
-    "MCAP without index": partial(
-        _mcap, form=Form(chunk_bytes=700, index=IndexType.NONE, repeat=False)
-    ),
-    "ROS 1 bag": _rosbag1,
-    "ROS 1 bag, lz4": partial(_rosbag1, compression="lz4"),
-    "ROS 2 bag": _rosbag2,
+    **{name: partial(_bag, bag=bag) for name, bag in BAGS.items()},
 }
 _EACH = pytest.mark.parametrize("name", FORMATS)
 
@@ -137,8 +129,7 @@ def _sizes(name: str, size_bytes: int) -> Iterator[int]:
 def test_the_first_buffer_may_end_at_every_byte(tmp_path: Path, name: str) -> None:
     rows = [(1, 9), (19, _LONG), (2, 7)] if "pcap" in name else [(2, 9), (6, 4), (1, 7), (5, 4)]
     packets = packets_of(rows)
-    path = tmp_path / "recording"
-    FORMATS[name](path, packets)
+    path = FORMATS[name](tmp_path, packets)
     for buffer_bytes in _sizes(name, path.stat().st_size):
         assert packets_read(name, path, buffer_bytes) == packets, buffer_bytes
     assert packets_read(name, path, 1 << 22) == packets
@@ -199,7 +190,6 @@ _ROWS = st.lists(st.tuples(st.integers(1, 200), st.integers(1, 200)), min_size=1
 def test_any_rows_and_any_buffer(name: str, rows: list[tuple[int, int]], buffer_bytes: int) -> None:
     packets = packets_of(rows)
     with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "recording"
-        FORMATS[name](path, packets)
+        path = FORMATS[name](Path(folder), packets)
         assert packets_read(name, path, buffer_bytes) == packets
         assert packets_read(name, path, 1 << 22) == packets

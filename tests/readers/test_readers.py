@@ -18,9 +18,9 @@ from mlbatch.readers.formats import rosbag2
 from mlbatch.types import CutOff, PacketBatch, StreamTable, WrappedRecording
 from tests.builders.bags import fixture_messages
 from tests.builders.captures import Packet, Section, pcap_bytes, section_bytes, udp_frame
+from tests.builders.containers import CONTAINERS
 from tests.builders.reading import open_capture, read, refusal
 from tests.builders.rosbag2 import write_rosbag2
-from tests.builders.sessions_of_bags import CONTAINERS
 
 CONTENT = pcap_bytes((i, udp_frame(random.Random(i).randbytes(1000))[0]) for i in range(300))
 

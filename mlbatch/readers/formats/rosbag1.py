@@ -10,18 +10,19 @@ from __future__ import annotations
 
 import contextlib
 import struct
-from collections.abc import Generator, Iterator, Sequence
+from collections.abc import Generator, Iterator
 from dataclasses import dataclass, field
 from enum import IntEnum
 from functools import partial
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
 from mlbatch.arrays import BoolArray, I64Array, U8Array
 from mlbatch.errors import RecordingError
 from mlbatch.readers.bag.recording import BagRecording, Portion
-from mlbatch.readers.byte_records import records, single
+from mlbatch.readers.byte_records import records
 from mlbatch.readers.source import BUFFER_BYTES, Decompressor, Source, Window, read_head
 from mlbatch.ros.definitions import type_key
 from mlbatch.types import CutOff, Recording, StreamTable, Topic
@@ -98,10 +99,10 @@ def _index(
     window = Window(source, buffer_bytes)
     window.begin = len(_MAGIC)
     try:
-        while not len((walked := _walk(window.data, window.begin, window.end)).head):
+        while not len((walked := _walk(window.data, window.begin, window.end)).rows):
             if _claims_too_much(window) or not window.refill():
                 return (), None, CutOff("the bag ends within its header")
-        fields = _head_fields(_bytes(window.data, walked.head[0], walked.head_size[0]))
+        fields = _head_fields(_bytes(window.data, *walked.rows[0, :2].tolist()))
         place = _number(fields, "index_pos")
         count = _number(fields, "conn_count")
         if fields.get("encryptor"):
@@ -116,7 +117,7 @@ def _index(
             # A file compressed as a whole is only read in order; its index may be intact.
             return (), None, ""
         index = np.frombuffer(source.look_at(place, _MAX_INDEX_BYTES), np.uint8)
-        records = _walk(index, 0, len(index))
+        records = _walk(index, 0, len(index)).rows
         topics = [topic for _, topic in _connections(index, records)]
         last_ns = _last_ns(index, records)
     except _HeadError as err:
@@ -201,42 +202,14 @@ def _connection_topic(fields: dict[str, bytes], data: bytes) -> tuple[int, Topic
     )
 
 
-@dataclass(frozen=True, slots=True)
-class _Records:
-    """n records in a row, (n,) int64 each: places and sizes of headers and data.
+class _Records(NamedTuple):
+    """Records in a row; those before byte `next` are complete.
 
-    The records before byte `next` are complete.
+    rows: (n, 4) int64, places and sizes: header, its size, data, their size.
     """
 
-    head: I64Array
-    head_size: I64Array
-    data: I64Array
-    data_size: I64Array
+    rows: I64Array
     next: int
-
-    def take(self, index: I64Array) -> _Records:
-        """The records at `index`."""
-        return _Records(
-            self.head[index],
-            self.head_size[index],
-            self.data[index],
-            self.data_size[index],
-            self.next,
-        )
-
-
-def _joined(parts: Sequence[_Records]) -> _Records:
-    """Records of several parts of one array."""
-    if len(parts) == 1:
-        return parts[0]
-    none = np.zeros(0, np.int64)
-    return _Records(
-        np.concatenate([none, *(part.head for part in parts)]),
-        np.concatenate([none, *(part.head_size for part in parts)]),
-        np.concatenate([none, *(part.data for part in parts)]),
-        np.concatenate([none, *(part.data_size for part in parts)]),
-        parts[-1].next if parts else 0,
-    )
 
 
 def _walk(data: U8Array, begin: int, end: int) -> _Records:
@@ -264,7 +237,7 @@ def _walk(data: U8Array, begin: int, end: int) -> _Records:
     body_at = np.array(bodies, np.int64)
     data_at = body_at + _WORD_BYTES
     following = np.append(head[1:] - _WORD_BYTES, at)[: len(head)]
-    return _Records(head, body_at - head, data_at, following - data_at, at)
+    return _Records(np.stack([head, body_at - head, data_at, following - data_at], axis=1), at)
 
 
 @dataclass(frozen=True, slots=True)
@@ -294,8 +267,7 @@ class _Template:
         return cls(at, np.frombuffer(raw, np.uint8)[at], connection[0], time[0])
 
 
-@dataclass(frozen=True, slots=True)
-class _Headers:
+class _Headers(NamedTuple):
     """Headers of n records: is_message (n,) bool; connection, log_ns: (n,) int64."""
 
     is_message: BoolArray
@@ -309,16 +281,16 @@ class _HeaderReader:
 
     _templates: dict[int, list[_Template]] = field(default_factory=dict)
 
-    def read(self, data: U8Array, walked: _Records) -> _Headers:
-        """Headers of records; _HeadError where one is damaged."""
-        count = len(walked.head)
+    def read(self, data: U8Array, found: I64Array) -> _Headers:
+        """Headers of records (n, 4); _HeadError where one is damaged."""
+        count = len(found)
         heads = _Headers(
             np.zeros(count, bool), np.zeros(count, np.int64), np.zeros(count, np.int64)
         )
-        for size in np.unique(walked.head_size).tolist():
-            rows = np.flatnonzero(walked.head_size == size)
+        for size in np.unique(found[:, 1]).tolist():
+            rows = np.flatnonzero(found[:, 1] == size)
             if size:
-                self._read_equal(data, walked.head[rows], size, rows, heads)
+                self._read_equal(data, found[rows, 0], size, rows, heads)
         return heads
 
     def _read_equal(
@@ -362,26 +334,20 @@ def _bytes(data: U8Array, begin: int, size: int) -> bytes:
     return data[begin : begin + size].tobytes()
 
 
-def _rows(walked: _Records) -> list[tuple[int, int, int, int]]:
-    """Records as (header, its size, data, their size)."""
-    columns = (walked.head, walked.head_size, walked.data, walked.data_size)
-    return list(zip(*(column.tolist() for column in columns), strict=True))
-
-
-def _connections(data: U8Array, walked: _Records) -> Iterator[tuple[int, Topic]]:
+def _connections(data: U8Array, found: I64Array) -> Iterator[tuple[int, Topic]]:
     """The connections among records, with their numbers."""
-    for head, head_size, body, size in _rows(walked):
+    for head, head_size, body, size in found.tolist():
         fields = _head_fields(_bytes(data, head, head_size))
         if _number(fields, "op") == _Op.CONNECTION:
             yield _connection_topic(fields, _bytes(data, body, size))
 
 
-def _last_ns(data: U8Array, walked: _Records) -> int | None:
+def _last_ns(data: U8Array, found: I64Array) -> int | None:
     """Newest log time by the chunk infos of an index; None where it is not stated for all."""
-    if len(walked.head) == _MOST_RECORDS:
+    if len(found) == _MOST_RECORDS:
         return None
     ends_ns = []
-    for head, head_size, _, _ in _rows(walked):
+    for head, head_size, _, _ in found.tolist():
         fields = _head_fields(_bytes(data, head, head_size))
         if _number(fields, "op") != _Op.CHUNK_INFO:
             continue
@@ -438,7 +404,7 @@ class _Pass:
             self._recording.position_bytes = self._source.position_bytes
             walked = _walk(window.data, window.begin, window.end)
             try:
-                yield from self._records(window.data, walked)
+                yield from self._records(window.data, walked.rows)
             except _HeadError as err:
                 note = f"{_at(window)}: {err}; the rest of the bag was not read"
                 self._recording.lose(CutOff(note))
@@ -449,18 +415,18 @@ class _Pass:
                 note = f"{_at(window)}: {fault}; the rest of the bag was not read"
                 self._recording.lose(CutOff(note))
                 return
-            if len(walked.head) < _MOST_RECORDS and not window.refill():
+            if len(walked.rows) < _MOST_RECORDS and not window.refill():
                 yield from self._end(window)
                 return
 
-    def _records(self, data: U8Array, walked: _Records) -> Generator[Portion, None, None]:
+    def _records(self, data: U8Array, found: I64Array) -> Generator[Portion, None, None]:
         """Records outside chunks: chunks, and messages of a bag that was never closed."""
         # Messages of many chunks are read together, if they are in one buffer.
         source = data
-        parts: list[_Records] = []
+        parts: list[I64Array] = []
         gathered_bytes = 0
         bare: list[int] = []
-        for index, (head, head_size, body, size) in enumerate(_rows(walked)):
+        for index, (head, head_size, body, size) in enumerate(found.tolist()):
             raw = _bytes(data, head, head_size)
             op = _op_of(raw)
             if op in (_Op.MESSAGE, _Op.CONNECTION):
@@ -486,16 +452,16 @@ class _Pass:
                 source, parts = chunk, []
             for part in self._inside(chunk, begin, end):
                 parts.append(part)
-                if len(part.head) == _MOST_RECORDS:
+                if len(part) == _MOST_RECORDS:
                     yield from self._messages(source, parts)
                     parts = []
         yield from self._messages(source, parts)
-        yield from self._messages(data, [walked.take(np.array(bare, np.int64))])
+        yield from self._messages(data, [found[bare]] if bare else [])
 
-    def _inside(self, data: U8Array, begin: int, end: int) -> Iterator[_Records]:
+    def _inside(self, data: U8Array, begin: int, end: int) -> Iterator[I64Array]:
         """The records of a chunk, in parts."""
         for walked in _parts(data, begin, end):
-            yield walked
+            yield walked.rows
         if walked.next < end and not self._cut:
             self._recording.lose(
                 f"a chunk: expected whole records, found {end - walked.next} other bytes; "
@@ -519,15 +485,14 @@ class _Pass:
             return found[: last.next]
         return found
 
-    def _messages(self, data: U8Array, parts: list[_Records]) -> Generator[Portion, None, None]:
+    def _messages(self, data: U8Array, parts: list[I64Array]) -> Generator[Portion, None, None]:
         """The selected messages among records; new connections are stored."""
-        walked = _joined(parts)
-        if not len(walked.head):
+        if not parts:
             return
+        found = np.concatenate(parts)
         try:
-            heads = self._reader.read(data, walked)
-            others = walked.take(np.flatnonzero(~heads.is_message))
-            for connection, topic in _connections(data, others):
+            heads = self._reader.read(data, found)
+            for connection, topic in _connections(data, found[~heads.is_message]):
                 self._connect(connection, topic)
         except _HeadError as err:
             if len(parts) == 1:
@@ -543,9 +508,8 @@ class _Pass:
         rows = rows[topic_of >= 0]
         topic_of = topic_of[topic_of >= 0]
         if len(rows):
-            begin = walked.data[rows]
-            end = begin + walked.data_size[rows]
-            yield Portion(data, begin, end, heads.log_ns[rows], topic_of)
+            begin = found[rows, 2]
+            yield Portion(data, begin, begin + found[rows, 3], heads.log_ns[rows], topic_of)
 
     def _connect(self, connection: int, topic: Topic) -> None:
         at = self._recording.number(topic)
@@ -565,9 +529,7 @@ class _Pass:
         # A cut chunk is read like a whole one; that it was cut is already counted.
         self._cut = True
         data = body + _WORD_BYTES
-        record = _Records(
-            single(head), single(body - head), single(data), single(window.end - data), 0
-        )
+        record = np.array([[head, body - head, data, window.end - data]], np.int64)
         with contextlib.suppress(_HeadError):
             if window.end > data:
                 yield from self._records(window.data, record)
@@ -576,7 +538,7 @@ class _Pass:
 def _parts(data: U8Array, begin: int, end: int) -> Iterator[_Records]:
     """The records of `data[begin:end]`, _MOST_RECORDS at a time; at least one part."""
     yield (walked := _walk(data, begin, end))
-    while len(walked.head) == _MOST_RECORDS:
+    while len(walked.rows) == _MOST_RECORDS:
         yield (walked := _walk(data, walked.next, end))
 
 

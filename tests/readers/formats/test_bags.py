@@ -2,17 +2,13 @@
 
 from __future__ import annotations
 
-import gzip
 import os
 import random
 import struct
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-import zstandard
-from mcap.writer import IndexType
 from rosbags.typesys import get_types_from_msg
 
 from mlbatch.errors import RecordingError
@@ -26,83 +22,20 @@ from tests.builders.bags import (
     fixture_packets,
     packet_message,
 )
-from tests.builders.mcaps import FORMS, LZ4, ZSTD, Form, write_mcap
+from tests.builders.containers import BAGS, Bag, database, mcap, rosbag1
+from tests.builders.mcaps import LZ4, ZSTD, Form
 from tests.builders.reading import Seen, open_bag, read, read_kept
-from tests.builders.rosbag1 import open_chunk, without_index, write_rosbag1
+from tests.builders.rosbag1 import open_chunk, without_index
 from tests.builders.sessions_of_bags import packets_only
 
 PACKETS = [Seen(host_ns, topic, payload) for topic, host_ns, payload in fixture_packets()]
 LATCHED = {"/left/ouster/metadata", "/right/ouster/metadata", "/tf_static"}
 OUSTER = {"cdr": "ouster_sensor_msgs/PacketMsg", "ros1": OUSTER_ROS1}
-Write = Callable[[Path, Sequence[Recorded]], Path]
-
-
-@dataclass(frozen=True, slots=True)
-class Bag:
-    """A kind of bag; notes: what is said of a file that is whole."""
-
-    container: str
-    encoding: str
-    write: Write
-    notes: int = 0
-
-
-def _mcap(form: Form) -> Bag:
-    def write(folder: Path, messages: Sequence[Recorded]) -> Path:
-        return write_mcap(folder / "a.mcap", messages, form)
-
-    return Bag("MCAP", form.encoding, write, 0 if form.summary else 1)
-
-
-def _rosbag1(compression: str, callers: int = 1, chunk_bytes: int = 100_000) -> Bag:
-    def write(folder: Path, messages: Sequence[Recorded]) -> Path:
-        path = folder / "a.bag"
-        return write_rosbag1(path, messages, compression, callers=callers, chunk_bytes=chunk_bytes)
-
-    return Bag("ROS 1 bag", "ros1", write)
-
-
-def _rosbag2(form: rosbag2.Form) -> Bag:
-    def write(folder: Path, messages: Sequence[Recorded]) -> Path:
-        return rosbag2.write_rosbag2(folder / "a.db3", messages, form)
-
-    return Bag("ROS 2 bag (sqlite3)", "cdr", write)
-
-
-def _packed(bag: Bag, squeeze: Callable[[bytes], bytes]) -> Bag:
-    """The same in a compressed file."""
-
-    def write(folder: Path, messages: Sequence[Recorded]) -> Path:
-        plain = bag.write(folder, messages)
-        packed = plain.with_name(f"{plain.name}.packed")
-        packed.write_bytes(squeeze(plain.read_bytes()))
-        plain.unlink()
-        return packed
-
-    return replace(bag, write=write)
-
-
-BAGS = {
-    **{f"MCAP, {name}": _mcap(form) for name, form in FORMS.items()},
-    "MCAP, chunks alone": _mcap(Form(index=IndexType.CHUNK, chunk_bytes=20_000)),
-    **{f"ROS 1, {word}": _rosbag1(word) for word in ("none", "bz2", "lz4")},
-    "ROS 1, three publishers": _rosbag1("lz4", callers=3),
-    "ROS 1, one chunk": _rosbag1("none", chunk_bytes=1 << 30),
-    "ROS 2": _rosbag2(rosbag2.Form()),
-    "ROS 2, schema 4": _rosbag2(rosbag2.Form(schema=4)),
-    "ROS 2, no format": _rosbag2(rosbag2.Form(serialization="")),
-    "ROS 2, zstd messages": _rosbag2(rosbag2.Form(zstd_messages=True)),
-    "ROS 2, no index": _rosbag2(rosbag2.Form(index=False)),
-    "MCAP, zstd file": _packed(_mcap(FORMS["no index"]), zstandard.compress),
-    "ROS 1, gzip file": _packed(_rosbag1("none"), gzip.compress),
-    "ROS 2, zstd file": _packed(_rosbag2(rosbag2.Form()), zstandard.compress),
-    "ROS 2, gzip file": _packed(_rosbag2(rosbag2.Form()), gzip.compress),
-}
 CHUNKS = {
-    "MCAP": _mcap(Form(chunk_bytes=20_000)),
-    "MCAP, zstd": _mcap(Form(compression=ZSTD, chunk_bytes=20_000)),
-    "MCAP, lz4": _mcap(Form(compression=LZ4, chunk_bytes=20_000)),
-    "ROS 1, bz2": _rosbag1("bz2"),
+    "MCAP": mcap(Form(chunk_bytes=20_000)),
+    "MCAP, zstd": mcap(Form(compression=ZSTD, chunk_bytes=20_000)),
+    "MCAP, lz4": mcap(Form(compression=LZ4, chunk_bytes=20_000)),
+    "ROS 1, bz2": rosbag1("bz2"),
 }
 ONE_OF_EACH = ["MCAP, none", "MCAP, unchunked", "MCAP, zstd", "ROS 1, lz4", "ROS 2"]
 
@@ -208,19 +141,19 @@ def test_files_of_one_bag_follow_their_times_not_their_names(
 # Bags that are cut, and which share of their packets comes at least if a share of the file is left;
 # None: all that are whole.
 CUT: dict[str, tuple[Bag, Callable[[float], float] | None]] = {
-    "MCAP": (_mcap(Form(summary=False, chunk_bytes=20_000)), None),
-    "MCAP, unchunked": (_mcap(Form(chunked=False, summary=False)), None),
+    "MCAP": (mcap(Form(summary=False, chunk_bytes=20_000)), None),
+    "MCAP, unchunked": (mcap(Form(chunked=False, summary=False)), None),
     "MCAP, one chunk, zstd": (
-        _mcap(Form(compression=ZSTD, summary=False, chunk_bytes=1 << 30)),
+        mcap(Form(compression=ZSTD, summary=False, chunk_bytes=1 << 30)),
         lambda share: 0.5 * (share >= 0.75),
     ),
     "MCAP, one chunk, lz4": (
-        _mcap(Form(compression=LZ4, summary=False, chunk_bytes=1 << 30)),
+        mcap(Form(compression=LZ4, summary=False, chunk_bytes=1 << 30)),
         lambda share: 0.5 * (share >= 0.75),
     ),
-    "ROS 1": (_rosbag1("none"), None),
-    "ROS 1, lz4": (_rosbag1("lz4"), lambda share: 0.0),
-    "ROS 2": (_rosbag2(rosbag2.Form()), lambda share: share - 0.05),
+    "ROS 1": (rosbag1("none"), None),
+    "ROS 1, lz4": (rosbag1("lz4"), lambda share: 0.0),
+    "ROS 2": (database(rosbag2.Form()), lambda share: share - 0.05),
 }
 
 
