@@ -128,7 +128,6 @@ SECONDS = (
     "poses/test_point_times.py",
     "poses/test_solve.py",
     "readers/bag/test_packet_messages.py::test_lengths",
-    "readers/capture/test_fragments.py::test_any_traffic",
     "readers/capture/test_fragments.py::test_pieces_of_any",
     "readers/capture/test_frames.py::test_any_traffic",
     "readers/capture/test_frames.py::test_frames_with_any_byte",

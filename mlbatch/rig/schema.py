@@ -68,12 +68,16 @@ _TEXT = re.compile(r"\S(.*\S)?")
 _WORD = re.compile(r"[^\s\x00-\x1f\x7f-\x9f\ud800-\udfff]+")
 
 
-def _word(what: str, pattern: re.Pattern[str] = _WORD) -> Callable[[Node], str]:
-    return lambda node: node.word(what, pattern)
+def _word_key(
+    name: str, what: str, about: str, pattern: re.Pattern[str] = _WORD, form: Form = WORD
+) -> Key[str]:
+    """A key whose value is text, "" without it; what: of an error."""
+    return Key(name, lambda node: node.word(what, pattern), "", form, about)
 
 
-def _choice(*words: str) -> Callable[[Node], str]:
-    return lambda node: node.choice(words)
+def _choice_key(name: str, words: tuple[str, ...], about: str) -> Key[str]:
+    """A key whose value is one of some words, "" without it."""
+    return Key(name, lambda node: node.choice(words), "", choice_form(*words), about)
 
 
 def _model(node: Node) -> str | None:
@@ -321,17 +325,13 @@ def _sensors(node: Node) -> tuple[Node, ...]:
 
 _SOURCE_IP = Key("source_ip", _ip_address, "", WORD, "source IP of the packets")
 _PORT = Key("port", lambda node: node.whole(1, 65535), 0, whole_form(1, 65535), "destination port")
-_TOPIC = Key("topic", _word("a topic without spaces"), "", WORD, "topic of a bag")
+_TOPIC = _word_key("topic", "a topic without spaces", "topic of a bag")
 # Text, since leading zeros count.
-_SERIAL = Key(
-    "serial", _word("a serial number without spaces"), "", WORD, "serial number in the packets"
-)
+_SERIAL = _word_key("serial", "a serial number without spaces", "serial number in the packets")
 # Of one of several lidars whose clouds share a topic.
-_FRAME_ID = Key(
+_FRAME_ID = _word_key(
     "frame_id",
-    _word("a frame_id without spaces"),
-    "",
-    WORD,
+    "a frame_id without spaces",
     "frame of one of several lidars whose clouds share a topic",
 )
 _LIDAR_ID: Key[int | None] = Key(
@@ -343,22 +343,14 @@ _LIDAR_ID: Key[int | None] = Key(
 )
 _STREAM_KEYS = (_SOURCE_IP, _PORT, _TOPIC, _SERIAL, _FRAME_ID, _LIDAR_ID)
 
-_POINT_TIME = Key("time", _word("the name of a field"), "", WORD, "field with the time of a point")
-_POINT_UNIT = Key(
-    "unit",
-    _choice("s", "ms", "us", "ns"),
-    "",
-    choice_form("s", "ms", "us", "ns"),
-    "unit of that field",
-)
-_POINT_ORIGIN = Key(
+_POINT_TIME = _word_key("time", "the name of a field", "field with the time of a point")
+_POINT_UNIT = _choice_key("unit", ("s", "ms", "us", "ns"), "unit of that field")
+_POINT_ORIGIN = _choice_key(
     "from",
-    _choice("start", "end", "back", "absolute"),
-    "",
-    choice_form("start", "end", "back", "absolute"),
+    ("start", "end", "back", "absolute"),
     "the header's stamp is that of the first point, of the last one; times are ages; or from 1970",
 )
-_POINT_RING = Key("ring", _word("the name of a field"), "", WORD, "field with the ring of a point")
+_POINT_RING = _word_key("ring", "the name of a field", "field with the ring of a point")
 # Of a sensor_msgs/PointField, and whole numbers of 64 bits.
 FIELD_TYPES = ("i1", "u1", "i2", "u2", "i4", "u4", "i8", "u8", "f4", "f8")
 _PADDING = re.compile(r"V([1-9]\d{0,3})", re.ASCII)
@@ -385,19 +377,11 @@ _ARRAYS: Key[dict[str, str]] = Key(
 )
 _POINTS_KEYS = (_POINT_TIME, _POINT_UNIT, _POINT_ORIGIN, _POINT_RING, _GLOB, _DTYPE, _ARRAYS)
 
-_CLOCK_SOURCE: Key[str | None] = Key(
-    "source",
-    _choice("sensor", "host"),
-    None,
-    choice_form("sensor", "host"),
-    "timestamps of packets, or their receive times",
+_CLOCK_SOURCE = _choice_key(
+    "source", ("sensor", "host"), "timestamps of packets, or their receive times"
 )
-_CLOCK_EPOCH: Key[str | None] = Key(
-    "epoch",
-    _choice("utc", "tai", "gps"),
-    None,
-    choice_form("utc", "tai", "gps"),
-    "what the timestamps count; converted to UTC",
+_CLOCK_EPOCH = _choice_key(
+    "epoch", ("utc", "tai", "gps"), "what the timestamps count; converted to UTC"
 )
 _CLOCK_OFFSET = Key(
     "offset_s",
@@ -428,11 +412,9 @@ _MATRIX: Key[F64Array | None] = Key(
     {"type": "array", "items": numbers_form(4), "minItems": 3, "maxItems": 4},
     "body_from_sensor, 4 x 4 or 3 x 4, m",
 )
-_FRAME_OF_EXTRINSICS = Key(
+_FRAME_OF_EXTRINSICS = _word_key(
     "frame",
-    _word("the name of a frame"),
-    "",
-    WORD,
+    "the name of a frame",
     "frame of the sensor in the file, or in the recording's transforms",
 )
 _POSE_KEYS = (_TRANSLATION, _ROTATION_RPY, _ROTATION_XYZW)
@@ -444,22 +426,14 @@ _FILES: Key[tuple[Path, ...]] = Key(
     {"anyOf": [TEXT, {"type": "array", "items": TEXT, "minItems": 1}]},
     "file or files with the extrinsics, relative to this file",
 )
-_PARENT = Key(
-    "parent", _word("the name of a frame"), "", WORD, "frame of the file that is the body frame"
-)
+_PARENT = _word_key("parent", "the name of a frame", "frame of the file that is the body frame")
 _MATRIX_KEYS: Key[tuple[str, ...]] = Key(
     "key", _matrix_keys, (), _SOME_WORDS, "key of a matrix in the file; several are multiplied"
 )
-_DIRECTION = Key(
-    "direction",
-    _choice("body_from_sensor", "sensor_from_body"),
-    "",
-    choice_form("body_from_sensor", "sensor_from_body"),
-    "what the matrix maps",
+_DIRECTION = _choice_key(
+    "direction", ("body_from_sensor", "sensor_from_body"), "what the matrix maps"
 )
-_MATRIX_UNIT = Key(
-    "matrix_unit", _choice("m", "mm"), "", choice_form("m", "mm"), "unit of their translations"
-)
+_MATRIX_UNIT = _choice_key("matrix_unit", ("m", "mm"), "unit of their translations")
 # Keys of streams and extrinsics that need another one.
 _NEEDS = {
     "frame_id": "topic",
@@ -508,12 +482,12 @@ _EXTRINSICS_FORM: Form = {
 }
 
 # A name fits ROS topics, frames and file names.
-_SENSOR_NAME = Key(
+_SENSOR_NAME = _word_key(
     "name",
-    _word(f"a name of at most {MAX_NAME} letters, digits and _, not a digit first", _NAME),
-    "",
-    text_form(rf"[A-Za-z_][A-Za-z0-9_]{{0,{MAX_NAME - 1}}}"),
+    f"a name of at most {MAX_NAME} letters, digits and _, not a digit first",
     "name in topics, folders and frames",
+    _NAME,
+    text_form(rf"[A-Za-z_][A-Za-z0-9_]{{0,{MAX_NAME - 1}}}"),
 )
 _MODEL: Key[str | None] = Key("model", _model, None, TEXT, "auto, or a name of `mlbatch sensors`")
 _STREAM: Key[StreamSelector | None] = Key(
@@ -558,12 +532,12 @@ _SENSOR_KEYS = (
 )
 
 # Fleets put the name of the robot before a slash.
-_BODY_FRAME = Key(
+_BODY_FRAME = _word_key(
     "body_frame",
-    _word("a frame name of letters, digits, _ and / that does not start with a digit", _FRAME),
-    DEFAULT_BODY_FRAME,
-    text_form(r"/?[A-Za-z_][A-Za-z0-9_]*(/[A-Za-z_][A-Za-z0-9_]*)*"),
+    "a frame name of letters, digits, _ and / that does not start with a digit",
     "frame of all points",
+    _FRAME,
+    text_form(r"/?[A-Za-z_][A-Za-z0-9_]*(/[A-Za-z_][A-Za-z0-9_]*)*"),
 )
 _RATE: Key[Fraction | None] = Key(
     "rate_hz",
@@ -614,7 +588,7 @@ def rig_schema() -> dict[str, object]:
 def rig_from(root: Node) -> Rig:
     """Return the rig that a tree describes; RigError for the first mistake."""
     fields = root.fields(names(_RIG_KEYS), required=_REQUIRED)
-    body_frame = _BODY_FRAME.of(fields)
+    body_frame = _BODY_FRAME.of(fields) or DEFAULT_BODY_FRAME
     rig = Rig(
         body_frame=body_frame,
         rate=_RATE.of(fields),
@@ -656,8 +630,8 @@ def _sensor(node: Node, body_frame: str) -> RigSensor:
         extrinsics=extrinsics,
         extrinsics_files=files,
         rotation_rpy_deg=_rpy_deg(fields),
-        clock=_CLOCK_SOURCE.of(clock),
-        epoch=_CLOCK_EPOCH.of(clock),
+        clock=_CLOCK_SOURCE.of(clock) or None,
+        epoch=_CLOCK_EPOCH.of(clock) or None,
         offset_ns=_CLOCK_OFFSET.of(clock),
         min_range_m=_MIN_RANGE.of(fields),
         max_range_m=_MAX_RANGE.of(fields),

@@ -106,19 +106,11 @@ class Reading(NamedTuple):
     is_absolute: bool
 
 
-@dataclass(frozen=True, slots=True)
-class _FloatTime:
-    """Meaning of floating-point times whose largest is between two values."""
-
-    above: float
-    below: float
-    reading: Reading
-
-
+# Meaning of floating-point times whose largest is above the first number and below the second.
 _FLOAT_TIMES = (
-    _FloatTime(-1e3, 1e3, Reading(NS_PER_S, is_absolute=False)),
-    _FloatTime(1e8, 1e11, Reading(NS_PER_S, is_absolute=True)),
-    _FloatTime(1e14, float(_LIMIT_NS), Reading(1, is_absolute=True)),
+    (-1e3, 1e3, Reading(NS_PER_S, is_absolute=False)),
+    (1e8, 1e11, Reading(NS_PER_S, is_absolute=True)),
+    (1e14, float(_LIMIT_NS), Reading(1, is_absolute=True)),
 )
 
 
@@ -129,7 +121,13 @@ def stamps(time: Times, zero: Zero, rule: PointRule, all_times: Times) -> tuple[
     """
     low = time.min()
     high = time.max()
-    reading = _reading(time.dtype, float(high), zero, rule)
+    reading = _reading(time.dtype, float(high), rule)
+    if reading is None:
+        raise CloudError(
+            f"field {zero.field}: expected s after {zero.base} (below 1000), or float64 s or ns "
+            f"since 1970, found {high:g}; give its unit in the rig (points: {{unit: us}}), or "
+            "record the raw packets"
+        )
     unit_ns, is_absolute = reading
     _check_values(float(low), float(high), zero, reading)
     if time.dtype.kind == "f":
@@ -217,38 +215,26 @@ def _float_ns(value: npt.NDArray[np.float64], unit_ns: int) -> I64Array:
     return ns
 
 
-def _reading(kind: np.dtype[Any], high: float, zero: Zero, rule: PointRule) -> Reading:
-    """Unit and zero of times: by the rule, else by convention."""
-    unit_ns = rule.unit_ns
-    reading = _by_unit(high, unit_ns) if unit_ns else _conventional(kind, high, zero)
-    return Reading(reading.unit_ns, rule.origin == ABSOLUTE) if rule.origin else reading
-
-
-def _conventional(kind: np.dtype[Any], high: float, zero: Zero) -> Reading:
-    """Unit and zero of times by convention; CloudError if there is none."""
+def _reading(kind: np.dtype[Any], high: float, rule: PointRule) -> Reading | None:
+    """Unit and zero of times up to `high`: by the rule, else by convention; None if unknown."""
     reading = convention(kind, high)
-    if reading is None:
-        raise CloudError(
-            f"field {zero.field}: expected s after {zero.base} (below 1000), or float64 s or ns "
-            f"since 1970, found {high:g}; give its unit in the rig (points: {{unit: us}}), or "
-            "record the raw packets"
-        )
-    return reading
+    if rule.unit_ns:
+        # Since 1970 if they are that large.
+        reading = Reading(rule.unit_ns, high * rule.unit_ns >= _LEAST_EPOCH_NS)
+    if reading is None or not rule.origin:
+        return reading
+    return Reading(reading.unit_ns, rule.origin == ABSOLUTE)
 
 
 def convention(kind: np.dtype[Any], high: float) -> Reading | None:
     """Unit and origin that drivers use for times of a type up to `high`; None if unknown."""
     if kind.kind != "f":
         return Reading(1, is_absolute=False)
-    reading = next((one.reading for one in _FLOAT_TIMES if one.above < high < one.below), None)
+    readings = (reading for above, below, reading in _FLOAT_TIMES if above < high < below)
+    reading = next(readings, None)
     if reading is not None and reading.is_absolute and kind.itemsize < _FLOAT64_BYTES:
         return None
     return reading
-
-
-def _by_unit(high: float, unit_ns: int) -> Reading:
-    """Times of a known unit: since 1970 if they are that large."""
-    return Reading(unit_ns, is_absolute=high * unit_ns >= _LEAST_EPOCH_NS)
 
 
 def _unit_name(unit_ns: int) -> str:
@@ -335,29 +321,27 @@ def checked_rule(
     high = median(np.array([one.high for one in usable]))
     rule = replace(rule, longest_ns=round(_SWEEP[1] * spacing_ns))
     notes: list[str] = []
-    if rule.unit_ns:
-        found_unit: Reading | None = _by_unit(high, rule.unit_ns)
-    else:
-        usual = convention(usable[-1].kind, high)
-        rule, found_unit = _inferred(name, span, spacing_ns, high, usual, rule, topic, notes)
-    if found_unit is None:
+    if not rule.unit_ns:
+        rule, notes = _inferred(usable[-1].kind, name, span, spacing_ns, high, rule, topic)
+    reading = _reading(usable[-1].kind, high, rule)
+    if reading is None:
         # Refused with its values when a cloud is read.
         return rule, notes
-    share = span * found_unit.unit_ns / spacing_ns
+    unit_ns = reading.unit_ns
+    share = span * unit_ns / spacing_ns
     if "unit" in rule.places:
-        _refuse_unit(name, span, spacing_ns, found_unit.unit_ns, rule)
-    shown = f"{span * found_unit.unit_ns / NS_PER_MS:.3f} ms in messages {apart.strip(' ()')} apart"
+        _refuse_unit(name, span, spacing_ns, unit_ns, rule)
+    shown = f"{span * unit_ns / NS_PER_MS:.3f} ms in messages {apart.strip(' ()')} apart"
     if share < _LEAST_SPAN and "unit" not in rule.places:
         raise CloudError(
             f"field {name}: expected times of points that span at least 5 % of the spacing of the "
             f"messages, found {shown}; {ways_out}"
         )
     if _LEAST_SPAN <= share < _USUAL_SPAN and "unit" not in rule.places:
-        unit = _unit_name(found_unit.unit_ns)
         notes.append(
             f"field {name}: points span {shown}, {100 * share:.0f} %, as those of a sector, of "
-            f"another field or of another unit: write points: {{unit: {unit}}} in the rig if that "
-            "is right"
+            f"another field or of another unit: write points: {{unit: {_unit_name(unit_ns)}}} in "
+            "the rig if that is right"
         )
     if share > _MOST_SPAN and share * spacing_ns <= _LONGEST_S * NS_PER_S:
         text = (
@@ -370,8 +354,6 @@ def checked_rule(
                 f"rig (points: {{unit: ns}}), or leave the topic out with --ignore {topic}"
             )
         notes.append(text)
-    is_absolute = found_unit.is_absolute if not rule.origin else rule.origin == ABSOLUTE
-    reading = Reading(found_unit.unit_ns, is_absolute)
     notes += _against_log_times(usable, reading, name, offset_ns, is_stated=bool(rule.origin))
     return rule, notes
 
@@ -382,10 +364,7 @@ def origin_as_read(samples: Sequence[CloudSample], rule: PointRule) -> str:
     if not usable or rule.origin:
         return rule.origin
     sample = usable[-1]
-    if rule.unit_ns:
-        reading: Reading | None = _by_unit(sample.high, rule.unit_ns)
-    else:
-        reading = convention(sample.kind, sample.high)
+    reading = _reading(sample.kind, sample.high, rule)
     if reading is not None and reading.is_absolute:
         return ABSOLUTE
     return "" if _counts_back(sample.low, sample.high) else START
@@ -405,13 +384,10 @@ def ahead_ns(samples: Sequence[CloudSample], rule: PointRule) -> int | None:
 
 def _last_stamp_ns(sample: CloudSample, rule: PointRule) -> int | None:
     """The stamp of the last point of a message."""
-    if rule.unit_ns:
-        reading: Reading | None = _by_unit(sample.high, rule.unit_ns)
-    else:
-        reading = convention(sample.kind, sample.high)
+    reading = _reading(sample.kind, sample.high, rule)
     if reading is None:
         return None
-    if rule.origin == ABSOLUTE or (not rule.origin and reading.is_absolute):
+    if reading.is_absolute:
         return round(sample.high * reading.unit_ns)
     if rule.origin == END and not _counts_back(sample.low, sample.high):
         return sample.zero.base_ns
@@ -421,34 +397,33 @@ def _last_stamp_ns(sample: CloudSample, rule: PointRule) -> int | None:
 
 
 def _inferred(
+    kind: np.dtype[Any],
     name: str,
     span: float,
     spacing_ns: float,
     high: float,
-    usual: Reading | None,
     rule: PointRule,
     topic: str,
-    notes: list[str],
-) -> tuple[PointRule, Reading | None]:
-    """The rule with the unit by which sweeps take as long as messages are apart."""
+) -> tuple[PointRule, list[str]]:
+    """The rule with the unit by which sweeps take as long as messages are apart, and a note."""
+    usual = convention(kind, high)
     fits = [
         (unit, unit_ns)
         for unit, unit_ns in UNITS_NS.items()
         if _SWEEP[0] <= span * unit_ns / spacing_ns <= _SWEEP[1]
     ]
-    if not fits or (usual is not None and usual.unit_ns == fits[0][1]):
-        return rule, usual
-    unit, unit_ns = fits[0]
-    if high * unit_ns >= _LIMIT_NS:
-        return rule, usual
+    unit, unit_ns = fits[0] if fits else ("", 0)
+    is_usual = usual is not None and usual.unit_ns == unit_ns
+    if not fits or is_usual or high * unit_ns >= _LIMIT_NS:
+        return rule, []
     instead = "" if usual is None else f", not {_unit_name(usual.unit_ns)} as usual"
     span_text = f"{span * unit_ns / NS_PER_MS:.3f} ms in messages {spacing_ns / NS_PER_MS:.3f} ms"
     text = f"inferred by sweeps of {span_text} apart{instead}"
-    notes.append(
+    note = (
         f"field {name}: its unit is {unit}, {text}; confirm it in the rig (points: "
         f"{{unit: {unit}}}), or leave the topic out with --ignore {topic}"
     )
-    return replace(rule, unit_ns=unit_ns, inferred=text), _by_unit(high, unit_ns)
+    return replace(rule, unit_ns=unit_ns, inferred=text), [note]
 
 
 def _refuse_unit(name: str, span: float, spacing_ns: float, unit_ns: int, rule: PointRule) -> None:

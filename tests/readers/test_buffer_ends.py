@@ -9,26 +9,20 @@ from __future__ import annotations
 import random
 import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
-import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from mcap.writer import IndexType
 
-from mlbatch.arrays import I64Array, U8Array
-from mlbatch.readers.byte_records import SLACK
-from mlbatch.readers.capture.recording import CaptureRecording
 from tests.builders import rosbag2
 from tests.builders.bags import OUSTER_ROS1, Recorded, packet_message
 from tests.builders.captures import (
     Interface,
     Packet,
     Section,
-    pcap_bytes,
     udp_frame,
     write_pcap,
     write_pcapng,
@@ -39,15 +33,10 @@ from tests.builders.reading import open_bag, open_capture, read
 
 OUSTER = "ouster_sensor_msgs/PacketMsg"
 T0_NS = 1_700_000_000_000_000_000
-_ETHERNET_HEADERS = 42
-_RECORD_BYTES = 16
-_FILE_HEADER_BYTES = 24
 # Not much larger than a frame.
 _SMALLEST = 64
 # Frames are longer than what follows the data in a buffer (`SLACK`).
 _LONG = 140
-# Rows up to this length end at every byte, longer ones at some.
-_ALL_BYTES = 30
 # Bags are read through buffers of every size up to this one.
 _MOST_OF_BAGS = 600
 
@@ -133,52 +122,6 @@ def test_the_first_buffer_may_end_at_every_byte(tmp_path: Path, name: str) -> No
     for buffer_bytes in _sizes(name, path.stat().st_size):
         assert packets_read(name, path, buffer_bytes) == packets, buffer_bytes
     assert packets_read(name, path, 1 << 22) == packets
-
-
-@pytest.mark.parametrize("big_endian", [False, True])
-def test_rows_of_any_length_end_at_every_byte_of_the_frames_around(
-    tmp_path: Path, big_endian: bool
-) -> None:
-    pick = random.Random(1)
-    path = tmp_path / "a.pcap"
-    for length in range(1, 201):
-        packets = packets_of([(2, 3), (length, _LONG), (1, 9), (2, 11)])
-        content = pcap_bytes(_frames(packets), big_endian=big_endian)
-        path.write_bytes(content)
-        recording = open_capture(path)
-        sizes = [len(payload) + _ETHERNET_HEADERS + _RECORD_BYTES for _, payload in packets]
-        after = np.cumsum([_FILE_HEADER_BYTES, *sizes])
-        file = _File(recording, np.frombuffer(content + bytes(SLACK), np.uint8), after)
-        # Around the 17th equal frame of the row, and around its last.
-        cuts = [
-            cut
-            for begin, end in ((17, 20), (length, length + 4))
-            for cut in range(int(after[min(begin, len(sizes))]), int(after[min(end, len(sizes))]))
-        ]
-        for cut in cuts if length <= _ALL_BYTES else pick.sample(cuts, 40):
-            file.check(cut, [at_ns for at_ns, _ in packets])
-
-
-@dataclass(frozen=True, slots=True)
-class _File:
-    """A capture with one buffer end; after: ends of its header and of each record."""
-
-    recording: CaptureRecording
-    data: U8Array
-    after: I64Array
-
-    def check(self, cut: int, host_ns: list[int]) -> None:
-        """A walk over the bytes before `cut`, and one over the rest, find all frames."""
-        walker = self.recording.walker()
-        whole = int(np.searchsorted(self.after[1:], cut, side="right"))
-        front = walker.walk(self.data[: cut + SLACK], 0, cut)
-        assert len(front.frames) == whole
-        assert front.next == self.after[whole]
-        rest = walker.walk(self.data, front.next, len(self.data) - SLACK)
-        start = np.concatenate([front.frames.start, rest.frames.start])
-        assert start.tolist() == (self.after[:-1] + _RECORD_BYTES).tolist()
-        found_ns = np.concatenate([front.frames.host_ns, rest.frames.host_ns])
-        assert found_ns.tolist() == host_ns
 
 
 _ROWS = st.lists(st.tuples(st.integers(1, 200), st.integers(1, 200)), min_size=1, max_size=4)
