@@ -15,7 +15,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from mlbatch.arrays import BoolArray, I64Array, U8Array
+from mlbatch.arrays import BoolArray, U8Array
 from mlbatch.readers.bag.mcap_records import (
     CHUNK_HEAD_BYTES,
     HEAD,
@@ -26,7 +26,7 @@ from mlbatch.readers.bag.mcap_records import (
     Op,
     chunk_head,
 )
-from mlbatch.readers.bag.recording import MOST_NOTES
+from mlbatch.readers.bag.recording import MOST_NOTES, Portion
 from mlbatch.readers.byte_records import records
 from mlbatch.readers.source import BUFFER_BYTES, MAX_RECORD_BYTES, Decompressor, Source, Window
 from mlbatch.types import CutOff, Topic
@@ -53,20 +53,6 @@ _OF_THE_FILE = (Op.CHUNK, Op.DATA_END, Op.FOOTER)
 _LARGE_BYTES = 1 << 20
 _AHEAD_BYTES = 1 << 14
 _SKIPPED = range(Op.CHUNK + 1, Op.DATA_END)
-
-
-@dataclass(slots=True)
-class Messages:
-    """Messages of selected channels in file order, (n,) int64 each.
-
-    Message i is `data[begin[i] : end[i]]`; valid until the next ones are requested.
-    """
-
-    data: U8Array
-    channel: I64Array
-    begin: I64Array
-    end: I64Array
-    log_ns: I64Array
 
 
 # -- records in a span of bytes -------------------------------------------------------------------
@@ -131,7 +117,7 @@ class Scanner:
                 return Span(at, fault=f"expected a record, found one of kind 0x{opcode:02x}")
             at += size
 
-    def gather(self, data: U8Array, starts: list[int]) -> Iterator[Messages]:
+    def gather(self, data: U8Array, starts: list[int]) -> Iterator[Portion]:
         """The selected messages among those at `starts`, which is then empty."""
         if not starts:
             return
@@ -146,7 +132,7 @@ class Scanner:
             end = at + head["length"].astype(np.int64) + HEAD.size
             channel = head["channel"].astype(np.int64)
             log_ns = head["log_ns"].astype(np.int64)
-            yield Messages(data, channel, at + _MESSAGE.itemsize, end, log_ns)
+            yield Portion(data, at + _MESSAGE.itemsize, end, log_ns, channel)
 
     def _learn(self, opcode: int, body: bytes) -> bool:
         """Add a schema or a channel; False if it cannot be parsed."""
@@ -209,8 +195,11 @@ class Walk:
     def __post_init__(self) -> None:
         self._scanner = Scanner(self.selects, self.channels)
 
-    def messages(self) -> Iterator[Messages]:
-        """All selected messages; damage is noted, only a failing disk raises."""
+    def messages(self) -> Iterator[Portion]:
+        """All selected messages; damage is noted, only a failing disk raises.
+
+        topic: number of the channel in the file.
+        """
         window = Window(self.source, self.buffer_bytes)
         window.begin = len(MAGIC)
         starts: list[int] = []
@@ -228,7 +217,7 @@ class Walk:
         """How far the next bytes are read; 0: as far as the buffer goes."""
         return self._need + _AHEAD_BYTES if self._need >= _LARGE_BYTES else 0
 
-    def _walk(self, window: Window, starts: list[int]) -> Iterator[Messages]:
+    def _walk(self, window: Window, starts: list[int]) -> Iterator[Portion]:
         """Walk until more bytes are needed, or to the end of the data."""
         can_continue = True
         while can_continue:
@@ -269,7 +258,7 @@ class Walk:
 
     def _enter(
         self, window: Window, length: int, starts: list[int]
-    ) -> Generator[Messages, None, bool]:
+    ) -> Generator[Portion, None, bool]:
         """Read the chunk at the window's first byte; False if more of it is needed."""
         at = window.begin
         place = window.place
@@ -301,7 +290,7 @@ class Walk:
             window.begin = after
         return True
 
-    def _compressed(self, window: Window, head: ChunkHead) -> Generator[Messages, None, str]:
+    def _compressed(self, window: Window, head: ChunkHead) -> Generator[Portion, None, str]:
         """Messages of the compressed chunk at the window's first byte; returns its fault or ""."""
         begin = window.begin + HEAD.size + head.start
         stored = window.data.data[begin : min(begin + head.length, window.end)]
@@ -319,7 +308,7 @@ class Walk:
         whole = span.next == len(data) and not span.fault
         return "" if whole else span.fault or _fault_in_chunk(span, len(data))
 
-    def _end(self, window: Window) -> Iterator[Messages]:
+    def _end(self, window: Window) -> Iterator[Portion]:
         """The file has no footer: read what is whole, note what is lost."""
         left = window.end - window.begin
         if left <= 0 and self._chunk_end is None:

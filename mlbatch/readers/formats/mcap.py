@@ -10,7 +10,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Generator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 
@@ -27,7 +27,7 @@ from mlbatch.readers.bag.mcap_records import (
     records_of,
     summary_start,
 )
-from mlbatch.readers.bag.mcap_walk import Messages, Walk
+from mlbatch.readers.bag.mcap_walk import Walk
 from mlbatch.readers.bag.recording import BagRecording, Portion
 from mlbatch.readers.source import BUFFER_BYTES, MAX_RECORD_BYTES, Source
 from mlbatch.types import Recording, StreamTable, Topic
@@ -188,12 +188,12 @@ class _TopicNumbers:
     channels: Channels
     _table: I64Array = field(default_factory=lambda: np.full(1 << 16, -1, np.int64))
 
-    def portion(self, messages: Messages) -> Portion:
+    def portion(self, messages: Portion) -> Portion:
         """Messages with the numbers of their topics."""
-        topic = self._table[messages.channel]
+        topic = self._table[messages.topic]
         if (topic < 0).any():
             for number, known in self.channels.topics.items():
                 if self.recording.selects(known):
                     self._table[number] = self.recording.number(known)
-            topic = self._table[messages.channel]
-        return Portion(messages.data, messages.begin, messages.end, messages.log_ns, topic)
+            topic = self._table[messages.topic]
+        return replace(messages, topic=topic)
