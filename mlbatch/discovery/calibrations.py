@@ -8,18 +8,14 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
-from mlbatch import readers, ros, sensors
+from mlbatch import readers, sensors
 from mlbatch.discovery.extrinsics import ExtrinsicsSources
 from mlbatch.errors import MlbatchError, RigError
 from mlbatch.frames.naming import nearest_topic
 from mlbatch.lidar.interface import Calibration, Evidence, Lidar
 from mlbatch.readers.datasets import BAG_METADATA
 from mlbatch.types import Message, PacketBatch, Recording, Topic
-
-if TYPE_CHECKING:
-    pass
 
 # Suffixes of calibration files in the recording's directory; vendors recognise them by content.
 CALIBRATION_SUFFIXES = (".csv", ".dat", ".json", ".xml", ".yaml", ".yml")
@@ -148,20 +144,23 @@ class MetadataCollector:
                 self.faults.append(str(err))
 
     def _read(self, message: Message) -> None:
+        # Not loaded for captures.
+        from mlbatch.ros.messages import decode_bytes, decode_string, decode_transforms
+
         topic = message.topic
         data = bytes(message.data)
         last_part = _last_part(topic)
         if topic.type in TRANSFORM_TYPES:
-            transforms = ros.decode_transforms(topic, data)
+            transforms = decode_transforms(topic, data)
             self.extrinsics.add_transforms("tf_static" if last_part == STATIC else "tf", transforms)
         elif topic.type == TEXT_TYPE and last_part == METADATA:
-            self._add_text(topic, ros.decode_string(topic, data).encode())
+            self._add_text(topic, decode_string(topic, data).encode())
         elif topic.type == BYTES_TYPE and last_part == CORRECTIONS:
-            self._add_text(topic, ros.decode_bytes(topic, data))
+            self._add_text(topic, decode_bytes(topic, data))
         elif topic.type == readers.CORRECTION_TYPE:
             self._add_text(topic, data)
         elif topic.type == TEXT_TYPE and last_part == DESCRIPTION:
-            self.extrinsics.add_urdf(ros.decode_string(topic, data))
+            self.extrinsics.add_urdf(decode_string(topic, data))
 
     def _add_text(self, topic: Topic, text: bytes) -> None:
         """Keep the first text of a topic: the settings at the start of the recording."""

@@ -7,6 +7,7 @@ file name. Memory follows the bytes that are there, not the sizes that a file cl
 from __future__ import annotations
 
 import bz2
+import gzip
 import importlib
 import os
 import stat
@@ -30,7 +31,6 @@ MAX_RECORD_BYTES = 1 << 28
 HEAD_BYTES = 64
 ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
 _GZIP_MAGIC = b"\x1f\x8b"
-_GZIP_WINDOW = 31  # zlib: gzip header, largest window
 _PIECE_BYTES = 1 << 18
 # Blocks up to this size are decompressed by one call.
 _ONE_CALL_BYTES = 16 << 20
@@ -42,30 +42,10 @@ class _Stream(Protocol):
     def readinto(self, target: memoryview) -> int | None: ...
 
 
-class _Inflate:
-    """A gzip file of one or more members as a stream."""
+class _Gzip(gzip.GzipFile):
+    """A gzip file of one or more members as a stream, piece by piece: a fault costs its own."""
 
-    def __init__(self, file: FileIO) -> None:
-        self._file = file
-        self._inflate = zlib.decompressobj(_GZIP_WINDOW)
-        self._input = b""
-
-    def readinto(self, target: memoryview) -> int:
-        """Fill `target` as far as one piece of input reaches; 0 at the end."""
-        while True:
-            if self._inflate.eof:
-                self._input = self._input or self._file.read(_PIECE_BYTES)
-                if not self._input.startswith(_GZIP_MAGIC):  # The end, or padding after it.
-                    return 0
-                self._inflate = zlib.decompressobj(_GZIP_WINDOW)
-            piece = self._input or self._file.read(_PIECE_BYTES)
-            output = self._inflate.decompress(piece, len(target))
-            self._input = self._inflate.unconsumed_tail or self._inflate.unused_data
-            if output:
-                target[: len(output)] = output
-                return len(output)
-            if not piece and not self._inflate.eof:
-                raise EOFError("they end early")
+    readinto = gzip.GzipFile.readinto1
 
 
 class Source:
@@ -114,11 +94,11 @@ class Source:
         while done < len(target) and not self.fault:
             try:
                 count = self._stream.readinto(target[done:])
-            except OSError as err:
-                raise RecordingError(_unreadable(self.path, err)) from err
-            except (EOFError, zlib.error, _zstd_error()) as err:
+            except (EOFError, gzip.BadGzipFile, zlib.error, _zstd_error()) as err:
                 self.fault = f"corrupt or cut-off compressed data ({err})"
                 break
+            except OSError as err:
+                raise RecordingError(_unreadable(self.path, err)) from err
             if not count:
                 break
             done += count
@@ -356,7 +336,7 @@ def _unreadable(path: Path, err: OSError) -> str:
 
 def _stream(file: FileIO, magic: bytes) -> _Stream:
     if magic.startswith(_GZIP_MAGIC):
-        return _Inflate(file)
+        return _Gzip(fileobj=file, mode="rb")
     if magic == ZSTD_MAGIC:
         import zstandard
 

@@ -12,8 +12,13 @@ from dataclasses import dataclass
 from functools import lru_cache
 from math import cos, radians, sin
 
+import numpy as np
+
+from mlbatch.arrays import U8Array
 from mlbatch.readers import open_recording
-from mlbatch.types import StreamTable
+from mlbatch.readers.bag.packet_messages import PacketsFound, Unpacker
+from mlbatch.ros.encoding import MessageError
+from mlbatch.types import StreamTable, Topic
 from tests.builders.two_lidars import FOLDER, LEFT, RIGHT, FixtureLidar
 
 OUSTER_ROS1 = "ouster_ros/PacketMsg"
@@ -155,6 +160,15 @@ def definition(type_name: str, encoding: str) -> str:
         if "std_msgs/Header" in parts:
             parts["builtin_interfaces/Time"] = "int32 sec\nuint32 nanosec\n"
     return main + "".join(f"{BREAK}\nMSG: {name}\n{text}" for name, text in parts.items())
+
+
+def packets_in(topic: Topic, data: U8Array, begin: int, end: int, log_ns: int = 0) -> PacketsFound:
+    """What is found in the message `data[begin:end]`; MessageError if it cannot be read."""
+    places = (np.array([value], np.int64) for value in (begin, end, log_ns))
+    found = Unpacker(topic).find_many(data, *places)
+    if found.faults:
+        raise MessageError(f"{topic.name}: {found.faults[0][1]}")
+    return found
 
 
 @lru_cache(maxsize=1)

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from mcap.reader import make_reader
 
-from mlbatch import ros
+from mlbatch.ros.messages import decode_transforms
 from mlbatch.types import Topic
 from mlbatch.verification import Verdict, verify
 from tests.builders.bags import Body, Recorded, fixture_messages, transforms_message
@@ -121,7 +121,7 @@ def test_frames_of_forwarded_messages_are_those_of_the_recording(tmp_path: Path)
     with target.open("rb") as file:
         data = [m.data for _, c, m in make_reader(file).iter_messages(["/tf_static"])]
     assert len(data) == 1
-    edges = ros.decode_transforms(Topic("/tf_static", "tf2_msgs/TFMessage", "cdr"), data[0])
+    edges = decode_transforms(Topic("/tf_static", "tf2_msgs/TFMessage", "cdr"), data[0])
     places = {child: list(xyz) for parent, child, xyz, _ in edges if parent == "base_link"}
     assert places["imu"] == pytest.approx([0.0, 0.0, 0.1])
     assert places["gps"] == pytest.approx([-0.5, 0.0, 1.6])

@@ -6,9 +6,9 @@ import pytest
 from rosbags.typesys import get_types_from_msg
 
 from mlbatch.errors import RecordingError
-from mlbatch.ros import decode_bytes, decode_string, decode_transforms
 from mlbatch.ros.definitions import definition as full_definition
 from mlbatch.ros.definitions import definition_text, definitions_of, is_known
+from mlbatch.ros.messages import decode_bytes, decode_string, decode_transforms
 from mlbatch.ros.packet_types import PACKET_TYPES
 from mlbatch.types import Topic
 from tests.builders.bags import Body, definition, transforms_message

@@ -269,13 +269,6 @@ class Unpacker:
         self._shapes: dict[int, list[Shape]] = {}
         self._known = 0
 
-    def find(self, data: U8Array, begin: int, end: int, log_ns: int) -> PacketsFound:
-        """The payloads of one message, `data[begin:end]`; MessageError if it cannot be read."""
-        found = self.find_many(data, single(begin), single(end), single(log_ns))
-        if found.faults:
-            raise MessageError(f"{self.topic.name}: {found.faults[0][1]}")
-        return found
-
     def find_many(
         self, data: U8Array, begin: I64Array, end: I64Array, log_ns: I64Array
     ) -> PacketsFound:
