@@ -211,14 +211,19 @@ def discover(
         unmatched = _unmatched(sampler, matched, noted, examined, _names(examined, recorded))
         if to_convert:
             texts = [] if selection.only else _refusals(refused)
-            texts += [note.message for kind, note in unmatched if not _is_owned(kind, chosen)]
-            _refuse_left_out(texts, recordings)
+            # Packets of another size on the stream of a sensor are rejected there.
+            owned = {stream for sensor in chosen for stream in sensor.streams}
+            texts += [note.message for kind, note in unmatched if kind.stream not in owned]
+            if texts:
+                # Lidars of the session would be left out whole.
+                raise RecordingError(f"{_paths(recordings)}: {_some_texts(texts)}")
         notes += [note for _, note in unmatched]
     else:
         # Other packets on the stream of a sensor are not unassigned but rejected.
         taken = {stream for sensor in chosen for stream in sensor.streams}
         noted = [kind for kind in noted if kind.stream not in taken]
-        notes += [_not_in_rig(sampler, kind) for kind in noted]
+        streams = sampler.table.streams
+        notes += [not_in_rig(streams[kind.stream], describe(sampler, kind) or "") for kind in noted]
     if clouds is not None:
         notes += _cloud_notes(table, clouds, chosen, to_convert=to_convert)
     notes += _unused(matched.sensors, selection.metadata)
@@ -227,7 +232,9 @@ def discover(
         sensor.offset_ns += selection.offset_ns.get(sensor.name, 0)
     notes += first.clouds_apart(chosen)
     if to_convert:
-        _refuse_shared_addresses(sampler, chosen)
+        for sensor in chosen:
+            if problem := shared_address(sampler, sensor):
+                raise RecordingError(problem)
         _refuse_incomparable_clocks(first, chosen, selection)
     extrinsics = place(
         chosen,
@@ -384,30 +391,28 @@ def _match(
 ) -> Matched:
     if rig is None or selection.rig is None:
         return match(sampler, calibrations, selection.decode)
-    origin = selection.rig
-    for sensor in rig.sensors:
-        _refuse_undecodable(sampler, sensor, origin)
-        _refuse_unknown_model(sensor, origin)
+    expected = [ExpectedSensor(one, (), selection.decode, selection.rig) for one in rig.sensors]
+    for sensor in expected:
+        _refuse_undecodable(sampler, sensor)
+        _refuse_unknown_model(sensor)
     sent_by = senders(sampler)
     expected = [
-        ExpectedSensor(
-            sensor,
-            [*calibrations, *_built_in(sent_by, sensor)]
-            if sensor.metadata is None
-            else [read_given(sensor.metadata)],
-            selection.decode,
+        sensor._replace(
+            calibrations=[*calibrations, *_built_in(sent_by, sensor.rig)]
+            if sensor.rig.metadata is None
+            else [read_given(sensor.rig.metadata)]
         )
-        for sensor in rig.sensors
+        for sensor in expected
     ]
     try:
-        matched = match_rig(sampler, expected, origin)
+        matched = match_rig(sampler, expected)
     except UsageError as err:
-        raise RigError(f"{origin}: {err}") from err
-    for sensor, detected in zip(rig.sensors, matched.sensors, strict=True):
-        if sensor.model is not None and not is_model(sensor.model, detected.lidar.model):
-            raise RigError(
-                f"{origin}: sensor {sensor.name}: expected the model {sensor.model}, found "
-                f"metadata of {detected.lidar.model}; correct model or metadata"
+        raise RigError(f"{selection.rig}: {err}") from err
+    for one, detected in zip(expected, matched.sensors, strict=True):
+        if not is_model(one.rig.model, detected.lidar.model):
+            raise one.error(
+                f"expected the model {one.rig.model}, found metadata of {detected.lidar.model}; "
+                "correct model or metadata"
             )
     return matched
 
@@ -422,18 +427,17 @@ def _built_in(sent_by: Collection[str], sensor: RigSensor) -> tuple[Calibration,
     return calibrations if len(calibrations) > 1 else sensors.built_in()
 
 
-def _refuse_undecodable(sampler: Sampler, sensor: RigSensor, origin: Path) -> None:
+def _refuse_undecodable(sampler: Sampler, expected: ExpectedSensor) -> None:
     """Raise RigError if no lidar on a sensor's stream has a decoder: metadata would not help."""
-    if sensor.stream is None or sensor.stream.serial:
+    stream = expected.rig.stream
+    if stream is None or stream.serial:
         return
     streams = sampler.table.streams
-    chosen = [kind for kind in sampler.kinds if sensor.stream.selects(streams[kind.stream])]
-    texts = [describe(sampler, kind) or "" for kind in chosen]
-    lidars = [text for text in texts if "lidar" in text]
-    if lidars and all(map(lacks_decoder, lidars)) and not _is_readable(sampler, chosen, sensor):
-        raise RigError(
-            f"{origin}: sensor {sensor.name}: {sensor.stream} carries {lidars[0]}; {_NO_SUPPORTED}"
-        )
+    chosen = [kind for kind in sampler.kinds if stream.selects(streams[kind.stream])]
+    lidars = [text for kind in chosen if "lidar" in (text := describe(sampler, kind) or "")]
+    is_undecodable = lidars and all(map(lacks_decoder, lidars))
+    if is_undecodable and not _is_readable(sampler, chosen, expected.rig):
+        raise expected.error(f"{stream} carries {lidars[0]}; {_NO_SUPPORTED}")
 
 
 def _is_readable(sampler: Sampler, kinds: Sequence[PacketKind], sensor: RigSensor) -> bool:
@@ -445,20 +449,16 @@ def _is_readable(sampler: Sampler, kinds: Sequence[PacketKind], sensor: RigSenso
     return any(one.match_score(sampler.evidence(kind)) for one in named for kind in kinds)
 
 
-def _refuse_unknown_model(sensor: RigSensor, origin: Path) -> None:
-    if sensor.model is None:
+def _refuse_unknown_model(expected: ExpectedSensor) -> None:
+    model = expected.rig.model
+    if model is None or any(row.name == model for row in sensors.models(sensors.vendor_of(model))):
         return
-    likely = sensors.models(sensors.vendor_of(sensor.model))
-    if all(row.name != sensor.model for row in likely):
-        known = [model.name for model in sensors.models()]
-        # Another case is more likely than other letters.
-        near = [name for name in known if name.lower() == sensor.model.lower()]
-        near = near or difflib.get_close_matches(sensor.model, known, 1)
-        advice = f"did you mean {near[0]}?" if near else "see `mlbatch sensors`, or write auto"
-        raise RigError(
-            f"{origin}: sensor {sensor.name}: expected a supported model, found "
-            f"{sensor.model!r}; {advice}"
-        )
+    known = [row.name for row in sensors.models()]
+    # Another case is more likely than other letters.
+    near = [name for name in known if name.lower() == model.lower()]
+    near = near or difflib.get_close_matches(model, known, 1)
+    advice = f"did you mean {near[0]}?" if near else "see `mlbatch sensors`, or write auto"
+    raise expected.error(f"expected a supported model, found {model!r}; {advice}")
 
 
 def _rig_offset_ns(sampler: Sampler, sensor: DetectedSensor) -> int:
@@ -523,6 +523,21 @@ def _advised(text: str, what: str) -> str:
     return with_advice(text, what)
 
 
+def _words(
+    sampler: Sampler, matched: Matched, kind: PacketKind, names: Sequence[str]
+) -> dict[str, object]:
+    """Words of a `Refusal` about packets of a lidar; names: of possible calibrations."""
+    stream = sampler.table.streams[kind.stream]
+    return {
+        "stream": stream,
+        "what": describe(sampler, kind) or "",
+        "failure": matched.failures.get(kind),
+        "known": f"only {some(names, _SHOWN)}" if names else "none in the recording's directory",
+        "others": f" (without a match: {some(names, _SHOWN)})" if names else "",
+        "ignore": f"--ignore {_ignore_word(stream)}",
+    }
+
+
 def _unmatched(
     sampler: Sampler,
     matched: Matched,
@@ -539,17 +554,10 @@ def _unmatched(
     faults = some([*filter(None, map(fault_of, examined))], _SHOWN) if kinds else ""
     for kind in kinds:
         what = describe(sampler, kind) or ""
-        stream = sampler.table.streams[kind.stream]
         cause = _cause(matched, kind, what)
         code, sentence, _ = _REFUSALS[cause]
-        text = sentence.format(
-            stream=stream,
-            what=what,
-            failure=matched.failures.get(kind),
-            known=_known(names),
-            ignore=f"--ignore {_ignore_word(stream)}",
-            faults=f" ({faults})" if faults else "",
-        )
+        words = _words(sampler, matched, kind, names)
+        text = sentence.format(**words, faults=f" ({faults})" if faults else "")
         text = _advised(text, what) if cause == "no_metadata" else text
         notes.append((kind, Note(code, "", text)))
     return notes
@@ -577,21 +585,10 @@ def _cloud_notes(
             yield Note("cloud_time", "", f"{topic}: {text}")
 
 
-def _refuse_left_out(texts: Sequence[str], recordings: Sequence[Recording]) -> None:
-    """Raise RecordingError if lidars of the session would be left out whole; texts: of each."""
-    if texts:
-        raise RecordingError(f"{_paths(recordings)}: {_some_texts(texts)}")
-
-
 def _some_texts(texts: Sequence[str]) -> str:
     """The first text in full, and how many others there are."""
     others = f" (and {len(texts) - 1} more: {'; '.join(texts[1:])})" if len(texts) > 1 else ""
     return texts[0] + others
-
-
-def _is_owned(kind: PacketKind, found: Sequence[DetectedSensor]) -> bool:
-    """True for packets of another size on the stream of a sensor, which are rejected there."""
-    return any(kind.stream in sensor.streams for sensor in found)
 
 
 def _ignore_word(stream: Stream) -> str:
@@ -610,11 +607,6 @@ def _refuse_clouds_of_rig(
         if topic in refused:
             place = f"{selection.rig}: sensor {sensor.name}"
             raise RigError(f"{place}: {topic}: {refused[topic]}")
-
-
-def _not_in_rig(sampler: Sampler, kind: PacketKind) -> Note:
-    """Warning about lidar packets in the first 10 s of a stream that the rig lacks."""
-    return not_in_rig(sampler.table.streams[kind.stream], describe(sampler, kind) or "")
 
 
 def not_in_rig(stream: Stream, what: str) -> Note:
@@ -681,8 +673,8 @@ def _why_none(
     table = sampler.table
     types = packet_types(recordings)
     found: dict[str, PacketKind] = {}
-    for kind in matched.failures:
-        found.setdefault("unusable", kind)
+    if matched.failures:
+        found["unusable"] = next(iter(matched.failures))
     if refused and not found:
         return f"{where}: {_some_texts(_refusals(refused))}", ""
     for kind in lidar_kinds:
@@ -690,16 +682,9 @@ def _why_none(
     for cause, refusal in _REFUSALS.items():
         if cause not in found:
             continue
-        kind = found[cause]
-        what = describe(sampler, kind) or ""
-        text = refusal.alone.format(
-            stream=table.streams[kind.stream],
-            what=what,
-            failure=matched.failures.get(kind),
-            others=f" (without a match: {some(names, _SHOWN)})" if names else "",
-            known=_known(names),
-        )
-        return f"{where}: {text}", what if cause == "no_metadata" else ""
+        words = _words(sampler, matched, found[cause], names)
+        lacking = str(words["what"]) if cause == "no_metadata" else ""
+        return f"{where}: {refusal.alone.format(**words)}", lacking
     seen = [
         f"{table.streams[kind.stream]} ({kind.size} bytes: {name_kind(sampler, kind, types)})"
         for kind in sampler.kinds
@@ -729,10 +714,6 @@ def _hints(
 
 def _paths(recordings: Sequence[Recording]) -> str:
     return ", ".join(str(recording.path) for recording in recordings)
-
-
-def _known(names: Sequence[str]) -> str:
-    return f"only {some(names, _SHOWN)}" if names else "none in the recording's directory"
 
 
 # -- choice and checks ----------------------------------------------------------------------------
@@ -789,13 +770,6 @@ def _choose(
             "leave one of them out"
         )
     return chosen
-
-
-def _refuse_shared_addresses(sampler: Sampler, chosen: Sequence[DetectedSensor]) -> None:
-    for sensor in chosen:
-        problem = shared_address(sampler, sensor)
-        if problem:
-            raise RecordingError(problem)
 
 
 def _refuse_incomparable_clocks(

@@ -276,11 +276,11 @@ class ExpectedSensor(NamedTuple):
     rig: RigSensor
     calibrations: Sequence[Calibration]
     options: Mapping[str, str]  # of the command line
+    origin: Path  # the rig file
 
-    @property
-    def name(self) -> str:
-        """Its name."""
-        return self.rig.name
+    def error(self, text: str) -> RigError:
+        """Return an error about it."""
+        return RigError(f"{self.origin}: sensor {self.rig.name}: {text}")
 
     @property
     def selector(self) -> StreamSelector:
@@ -305,38 +305,37 @@ class ExpectedSensor(NamedTuple):
         ]
 
 
-def match_rig(sampler: Sampler, expected: Sequence[ExpectedSensor], origin: Path) -> Matched:
-    """Sensors of a rig, in its order; origin: the rig file.
-
-    Raises RigError for a sensor without a matching calibration.
-    """
-    detected = [_detect(sampler, one, origin) for one in expected]
+def match_rig(sampler: Sampler, expected: Sequence[ExpectedSensor]) -> Matched:
+    """Sensors of a rig, in its order; RigError for a sensor without a matching calibration."""
+    detected = [_detect(sampler, one) for one in expected]
     seen = [sensor for sensor in detected if sensor is not None]
-    _refuse_same_packets(sampler.table, seen, origin)
+    _refuse_same_packets(sampler.table, seen, expected[0].origin)
     taken = {kind for sensor in seen for kind in sensor.kinds}
     unknown = [kind for kind in sampler.kinds if kind not in taken]
     used = {sensor.lidar.calibration for sensor in seen}
     found = [
-        sensor or _silent(sampler, one, unknown, used, origin)
+        sensor or _silent(sampler, one, unknown, used)
         for sensor, one in zip(detected, expected, strict=True)
     ]
     return Matched(found, unknown, {})
 
 
-def is_model(expected: str, found: str) -> bool:
-    """True if a lidar may be of the model that the rig names."""
+def is_model(expected: str | None, found: str) -> bool:
+    """True if a lidar may be of the model that the rig names, if it names one."""
+    if expected is None:
+        return True
     rows = sensors.models(sensors.vendor_of(expected))
     reported_as = {row.same_packets_as for row in rows if row.name == expected}
     # Product lines carry suffixes for beam spacing: OS-1-64-AH is an OS1-64.
     return found in reported_as or found.replace("-", "").startswith(expected.replace("-", ""))
 
 
-def _detect(sampler: Sampler, expected: ExpectedSensor, origin: Path) -> DetectedSensor | None:
+def _detect(sampler: Sampler, expected: ExpectedSensor) -> DetectedSensor | None:
     """A sensor of the rig by its packets; None if it sent none."""
     serial = expected.selector.serial
     usable = expected.usable()
     if not usable:
-        _refuse_no_metadata(expected, origin)
+        _refuse_no_metadata(expected)
     has_own_file = any(serial and one.serial == serial for one in usable)
     if has_own_file:
         usable = [one for one in usable if one.serial == serial]
@@ -354,38 +353,33 @@ def _detect(sampler: Sampler, expected: ExpectedSensor, origin: Path) -> Detecte
         for fit in fits:
             if serial and fit.lidar.serial != serial:
                 other_serials.add(fit.lidar.serial)
-            elif expected.rig.model is not None and not is_model(
-                expected.rig.model, fit.lidar.model
-            ):
+            elif not is_model(expected.rig.model, fit.lidar.model):
                 other_models.add(fit.lidar.model)
             else:
                 known = matches.get(fit.number, fit)
                 best = fit if fit.score > known.score else known
                 matches[fit.number] = best._replace(kinds=known.kinds | {kind})
     if matches:
-        return _chosen(sampler, expected, list(matches.values()), origin)
-    start = f"{origin}: sensor {expected.name}:"
+        return _chosen(sampler, expected, list(matches.values()))
     if failures:
-        raise RigError(f"{start} {failures[0]}")
+        raise expected.error(failures[0])
     if serial and not has_own_file:
         found = ", ".join(sorted(other_serials - {""}))
         if not found:
-            _refuse_no_metadata(expected, origin)
-        raise RigError(
-            f"{start} expected packets of serial number {serial}, found those of {found}; correct "
-            "the serial"
+            _refuse_no_metadata(expected)
+        raise expected.error(
+            f"expected packets of serial number {serial}, found those of {found}; correct the "
+            "serial"
         )
     if other_models:
-        raise RigError(
-            f"{start} expected packets of the model {expected.rig.model}, found those of "
+        raise expected.error(
+            f"expected packets of the model {expected.rig.model}, found those of "
             f"{', '.join(sorted(other_models))}; correct model, stream or metadata"
         )
     return None
 
 
-def _chosen(
-    sampler: Sampler, expected: ExpectedSensor, matches: Sequence[Fit], origin: Path
-) -> DetectedSensor:
+def _chosen(sampler: Sampler, expected: ExpectedSensor, matches: Sequence[Fit]) -> DetectedSensor:
     """The only sensor that matches; merely readable packets count only without others."""
     sure = [one for one in matches if one.score != NAMED_ONLY] or matches
     best = max(sure, key=lambda one: one.score)
@@ -394,14 +388,12 @@ def _chosen(
     streams = {str(sampler.table.streams[kind.stream]) for one in sure for kind in one.kinds}
     if len(units) > 1 or (len(streams) > 1 and not lidar.carries_serial):
         models = sorted({one.lidar.model for one in sure})
-        raise RigError(
-            f"{origin}: sensor {expected.name}: expected packets of one lidar, found those of "
-            f"several ({', '.join(models)}) on {', '.join(sorted(streams))}; name its stream "
-            "(source_ip, port, topic or serial)"
+        raise expected.error(
+            f"expected packets of one lidar, found those of several ({', '.join(models)}) on "
+            f"{', '.join(sorted(streams))}; name its stream (source_ip, port, topic or serial)"
         )
-    found = DetectedSensor(
-        expected.name, lidar, expected.selector, set(best.kinds), rig=expected.rig
-    )
+    rig = expected.rig
+    found = DetectedSensor(rig.name, lidar, expected.selector, set(best.kinds), rig=rig)
     if best.score == NAMED_ONLY:
         what = describe(sampler, min(best.kinds)) or "another model"
         found.notes.append(f"read as {lidar.model}, which the rig names; it looks like {what}")
@@ -450,18 +442,17 @@ def _refuse_same_packets(table: StreamTable, found: Sequence[DetectedSensor], or
                 )
 
 
-def _refuse_no_metadata(expected: ExpectedSensor, origin: Path) -> NoReturn:
+def _refuse_no_metadata(expected: ExpectedSensor) -> NoReturn:
     # Not loaded where all have theirs.
     from mlbatch.sensors.advice import with_advice
 
     serial = expected.selector.serial
-    text = (
-        f"{origin}: sensor {expected.name}: no metadata"
-        + (f" with serial number {serial}" if serial else "")
-        + f" among {_paths(expected.calibrations)}; give it as `metadata:` of the sensor, or "
-        "with --metadata"
+    numbered = f" with serial number {serial}" if serial else ""
+    error = expected.error(
+        f"no metadata{numbered} among {_paths(expected.calibrations)}; give it as `metadata:` of "
+        "the sensor, or with --metadata"
     )
-    raise RigError(with_advice(text, _vendor_of(expected.rig.model or "")))
+    raise RigError(with_advice(str(error), _vendor_of(expected.rig.model or "")))
 
 
 def _vendor_of(model: str) -> str:
@@ -475,10 +466,8 @@ def _silent(
     expected: ExpectedSensor,
     unknown: Sequence[PacketKind],
     used: Collection[str],
-    origin: Path,
 ) -> DetectedSensor:
     """A sensor of the rig that sent no packet; used: calibrations of sensors that did."""
-    start = f"{origin}: sensor {expected.name}:"
     lidar: Lidar | None = None
     others = lidars_on(sampler, expected.selector, unknown)
     own = _own_calibrations(expected, used)
@@ -487,34 +476,29 @@ def _silent(
             lidar = own[0].lidar(expected.decode, None)
         except RigError as err:
             if not others or own[0].path is None:
-                raise RigError(f"{start} {err}") from err
+                raise expected.error(str(err)) from err
     if others:
-        _refuse_other_lidars(expected, own, lidar, others, origin)
+        _refuse_other_lidars(expected, own, lidar, others)
     if lidar is None:
         selector = f" ({expected.selector})" if str(expected.selector) else ""
         which = f"which of {_paths(own)} is its metadata" if own else "its model"
         remedy = "`metadata:`" if own else "`metadata:` or `model:`"
         streams = {str(sampler.table.streams[kind.stream]) for kind in sampler.kinds}
         seen = f" (others are of {some(sorted(streams))})" if expected.selector.topic else ""
-        raise RigError(
-            f"{start} expected a packet of it{selector} in the first 10 seconds, found none to "
-            f"decide {which}{seen}; correct its stream, or give {remedy}"
+        raise expected.error(
+            f"expected a packet of it{selector} in the first 10 seconds, found none to decide "
+            f"{which}{seen}; correct its stream, or give {remedy}"
         )
-    return DetectedSensor(expected.name, lidar, expected.selector, rig=expected.rig)
+    return DetectedSensor(expected.rig.name, lidar, expected.selector, rig=expected.rig)
 
 
 def _refuse_other_lidars(
-    expected: ExpectedSensor,
-    own: Sequence[Calibration],
-    lidar: Lidar | None,
-    others: str,
-    origin: Path,
+    expected: ExpectedSensor, own: Sequence[Calibration], lidar: Lidar | None, others: str
 ) -> None:
     """Raise RigError if other lidars' packets are on the stream of a silent sensor."""
-    start = f"{origin}: sensor {expected.name}: expected"
     if not own:
-        raise RigError(
-            f"{start} metadata that match {others}, found none; give them as `metadata:` of the "
+        raise expected.error(
+            f"expected metadata that match {others}, found none; give them as `metadata:` of the "
             "sensor, or with --metadata"
         )
     has_stream = bool(expected.selector.source_ip or expected.selector.topic)
@@ -523,8 +507,9 @@ def _refuse_other_lidars(
     if has_stream or (len(own) == 1 and not has_serial):
         is_built_in = any(one.path is None for one in own)
         which = f"of the model {expected.rig.model}" if is_built_in else f"that match {_paths(own)}"
-        remedy = "correct model, stream or metadata"
-        raise RigError(f"{start} packets {which}, found {others}; {remedy}")
+        raise expected.error(
+            f"expected packets {which}, found {others}; correct model, stream or metadata"
+        )
 
 
 def _own_calibrations(expected: ExpectedSensor, used: Collection[str]) -> list[Calibration]:

@@ -103,10 +103,11 @@ def _match(rig: Rig, path: Path) -> None:
             one,
             [sensors.read_calibration(one.metadata) or every[0]] if one.metadata else every,
             {},
+            path,
         )
         for one in rig.sensors
     ]
-    match_rig(_sampler(), expected, path)
+    match_rig(_sampler(), expected)
 
 
 def _urdfs() -> Seeds:
