@@ -129,23 +129,16 @@ def problem(
 
 def _groups(spans: Sequence[LidarSpan]) -> list[_Group]:
     """Recordings in groups that share no lidar, by first receive time."""
-    known = [span for span in spans if span.first_ns is not None]
-    above: dict[str, str] = {}
-
-    def top(lidar: str) -> str:
-        while (higher := above.setdefault(lidar, lidar)) != lidar:
-            above[lidar] = above[higher]
-            lidar = higher
-        return lidar
-
-    for span in known:
-        first, *others = span.lidars
-        for other in others:
-            above[top(other)] = top(first)
-    groups: dict[str, _Group] = {}
-    for span in sorted(known, key=lambda span: span.first_ns or 0):
-        groups.setdefault(top(next(iter(span.lidars))), _Group([])).spans.append(span)
-    return list(groups.values())
+    groups: list[_Group] = []
+    for span in spans:
+        if span.first_ns is None:
+            continue
+        shared = [group for group in groups if group.lidars & span.lidars]
+        groups = [group for group in groups if group not in shared]
+        groups.append(_Group([span, *(one for group in shared for one in group.spans)]))
+    for group in groups:
+        group.spans.sort(key=lambda span: span.first_ns or 0)
+    return sorted(groups, key=lambda group: group.first_ns)
 
 
 def _long_break(spans: Sequence[LidarSpan]) -> str:

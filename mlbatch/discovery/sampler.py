@@ -51,6 +51,13 @@ class KindSamples:
     first_words: set[int]  # of the packets kept for their first word
     since_tick: int = 0  # packets since the first one of a quarter of a second
 
+    def keep(self, batch: PacketBatch, at: int, size: int, number: int) -> None:
+        """Keep packet `at` of a batch; number: among all of the kind."""
+        begin = int(batch.start[at])
+        self.pieces.append(batch.data[begin : begin + size].tobytes())
+        self.host_ns.append(int(batch.host_ns[at]))
+        self.numbers.append(number)
+
     def arrays(self) -> tuple[U8Array, I64Array]:
         """Kept payloads (k, size) and their receive times (k,)."""
         if len(self.pieces) > 1:
@@ -146,11 +153,7 @@ class Sampler:
             first_ns = int(batch.host_ns[index[0]])
             samples = self.kinds.get(kind) or self._new(kind, first_ns)
             for row in _rows_to_keep(samples, kind, index, batch):
-                at = int(index[row])
-                begin = int(batch.start[at])
-                samples.pieces.append(batch.data[begin : begin + kind.size].tobytes())
-                samples.host_ns.append(int(batch.host_ns[at]))
-                samples.numbers.append(samples.packets + row)
+                samples.keep(batch, int(index[row]), kind.size, samples.packets + row)
             samples.packets += len(index)
             samples.last_host_ns = int(batch.host_ns[index[-1]])
 
@@ -176,11 +179,7 @@ class Sampler:
         first_ns = int(batch.host_ns[index[0]])
         is_new = kind not in self.kinds
         if is_new:
-            samples = self._new(kind, first_ns)
-            begin = int(batch.start[index[0]])
-            samples.pieces.append(batch.data[begin : begin + kind.size].tobytes())
-            samples.host_ns.append(first_ns)
-            samples.numbers.append(0)
+            self._new(kind, first_ns).keep(batch, int(index[0]), kind.size, 0)
         samples = self.kinds[kind]
         if not samples.packets:
             samples.first_host_ns = first_ns

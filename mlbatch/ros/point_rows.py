@@ -16,8 +16,8 @@ from mlbatch.native.library import address, library
 Rows: TypeAlias = npt.NDArray[Any]
 AXES = ("x", "y", "z")
 REAL_ROLES = (*AXES, "intensity")
-# sensor_msgs/PointField, by numpy's name of the type.
-_NUMBERS = {"i1": 1, "u1": 2, "i2": 3, "u2": 4, "i4": 5, "u4": 6, "f4": 7, "f8": 8}
+# sensor_msgs/PointField: datatypes by numpy's names of types.
+FIELD_NUMBERS = {"i1": 1, "u1": 2, "i2": 3, "u2": 4, "i4": 5, "u4": 6, "f4": 7, "f8": 8}
 # A field that is not there.
 _NONE = (0, 0)
 
@@ -56,7 +56,7 @@ def take_rows(rows: Rows) -> TakenRows:
         rows.strides[0],
         address(real_at),
         address(real_type),
-        _NUMBERS[known["time"][0].str[1:]],
+        FIELD_NUMBERS[known["time"][0].str[1:]],
         len(roles),
         address(field_at),
         address(field_bytes),
@@ -75,4 +75,4 @@ def field_of(known: dict[str, Any], name: str) -> tuple[int, int]:
     if name not in known:
         return _NONE
     dtype, first = known[name][:2]
-    return first, _NUMBERS[dtype.str[1:]]
+    return first, FIELD_NUMBERS[dtype.str[1:]]

@@ -18,14 +18,13 @@ import numpy.typing as npt
 from mlbatch.arrays import U16Array
 from mlbatch.ros.encoding import Cursor, MessageError
 from mlbatch.ros.point_packets import CloudError, Points
-from mlbatch.ros.point_rows import AXES, Rows, take_rows
+from mlbatch.ros.point_rows import AXES, FIELD_NUMBERS, Rows, take_rows
 from mlbatch.ros.point_times import CONVENTION, TIME_NAMES, CloudSample, PointRule, Zero, stamps
 from mlbatch.types import Message
 
 _Whole = TypeVar("_Whole", np.uint8, np.uint16)
 
-# sensor_msgs/PointField: datatype by its number.
-_TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
+_TYPES = {number: name for name, number in FIELD_NUMBERS.items()}
 _MOST_FIELDS = 256
 # Of the numbers in the fields.
 _ALIGN = 4

@@ -9,7 +9,6 @@ from __future__ import annotations
 import errno
 import io
 import re
-import struct
 import zipfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -20,8 +19,9 @@ import numpy.typing as npt
 
 from mlbatch.bounded import read_bytes
 from mlbatch.rig.rig import Sweeps
+from mlbatch.ros.encoding import Wire
+from mlbatch.ros.point_rows import FIELD_NUMBERS
 from mlbatch.ros.point_times import TIME_NAMES, PointRule
-from mlbatch.units import NS_PER_S
 
 _PCD_HEADS = (b"# .PCD", b"VERSION", b"#.PCD", b"FIELDS")
 _PCD_KEYS = (b"FIELDS", b"SIZE", b"TYPE", b"WIDTH", b"HEIGHT", b"POINTS", b"DATA")
@@ -29,8 +29,6 @@ _PCD_KINDS = {"F": "f", "U": "u", "I": "i"}
 _MOST_HEAD_BYTES = 1 << 16
 _SIZE = re.compile(r"[1-9]\d{0,4}", re.ASCII)
 _DIGITS = re.compile(r"\d{1,12}", re.ASCII)
-# sensor_msgs/PointField: number of a datatype.
-_NUMBERS = {"i1": 1, "u1": 2, "i2": 3, "u2": 4, "i4": 5, "u4": 6, "f4": 7, "f8": 8}
 # Whole numbers of 64 bits, as times since 1970; a PointField has none, so they become float64.
 _WIDE = ("i8", "u8")
 _NPY_HEAD = b"\x93NUMPY"
@@ -234,7 +232,7 @@ def _pcd(path: Path, data: bytes) -> _Columns:
                 "the file is damaged"
             )
         text = f"{_PCD_KINDS.get(kind, '?')}{size}"
-        single = text in (*_NUMBERS, *_WIDE) and repeated == "1" and name != "_"
+        single = text in (*FIELD_NUMBERS, *_WIDE) and repeated == "1" and name != "_"
         fields.append((name, text if single else f"V{int(size) * int(repeated)}"))
     count = _count(path, head)
     step = sum(int(kind[1:]) for _, kind in fields)
@@ -314,13 +312,15 @@ def _ascii(path: Path, body: bytes, fields: Sequence[tuple[str, str]], count: in
 
 def _message(rows: _Array, stamp_ns: int) -> bytes:
     """A sensor_msgs/PointCloud2 in ROS 1 serialisation, without a frame_id."""
-    seconds, rest = divmod(stamp_ns, NS_PER_S)
     fields: Mapping[str, Any] = rows.dtype.fields or {}
-    head = struct.pack("<IIII", 0, seconds, rest, 0)
-    head += struct.pack("<III", 1, len(rows), len(fields))
+    wire = Wire("ros1")
+    wire.header(stamp_ns, "")
+    wire.put("I", 1, len(rows), len(fields))
     for name, (kind, offset, *_) in fields.items():
-        text = name.encode()
-        head += struct.pack("<I", len(text)) + text
-        head += struct.pack("<IBI", offset, _NUMBERS[f"{kind.kind}{kind.itemsize}"], 1)
-    head += struct.pack("<BIII", 0, rows.dtype.itemsize, rows.nbytes, rows.nbytes)
-    return b"".join((head, rows.tobytes(), b"\1"))
+        wire.text(name)
+        wire.put("I", offset)
+        wire.put("B", FIELD_NUMBERS[f"{kind.kind}{kind.itemsize}"])
+        wire.put("I", 1)
+    wire.put("B", False)
+    wire.put("I", rows.dtype.itemsize, rows.nbytes, rows.nbytes)
+    return b"".join((wire.data, rows.tobytes(), b"\1"))
