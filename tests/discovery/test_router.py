@@ -13,10 +13,8 @@ import pytest
 from tests.builders.captures import udp_frame
 from tests.builders.sessions import (
     EPOCH_NS,
-    NO_RECORDINGS,
     NS_PER_MS,
     NS_PER_S,
-    RECORDINGS,
     SMALL,
     Records,
     Shell,
@@ -28,13 +26,11 @@ from tests.builders.sessions import (
 
 Report = dict[str, Any]
 Convert = Callable[[str], Report]
-OUSTER = RECORDINGS / "ouster"
 _METADATA_ADVICE = (
     ". Ouster calls it metadata (JSON): get it with `curl "
     "http://SENSOR_IP/api/v1/sensor/metadata > left.json`, or take the .json that Ouster Studio, "
     "ouster-cli or the driver saved next to its recording"
 )
-needs_recordings = pytest.mark.skipif(not RECORDINGS.is_dir(), reason=NO_RECORDINGS)
 PACKETS = 96  # 3 revolutions
 IDENTITY = "--identity-extrinsics"
 
@@ -412,30 +408,3 @@ def test_a_rig_separates_equal_lidars_without_serial_numbers_by_address(
     # Points nearer than 5 m are those of the first lidar.
     cut = convert(f"{capture} --rig {rig} --min-range 5")
     assert [sensor["points"]["written"] > 0 for sensor in cut["sensors"]] == [True, False]
-
-
-# -- real recordings ------------------------------------------------------------------------------
-
-
-@needs_recordings
-@pytest.mark.parametrize("kind", ["legacy", "nonlegacy"])
-def test_two_real_lidars_on_one_port(convert: Convert, kind: str) -> None:
-    case = OUSTER / f"two-sensors_same-ports_{kind}" / f"same_ports_{kind}.pcap"
-    report = convert(f"{case} --identity-extrinsics --clock host")
-    found = {
-        sensor["name"]: (sensor["stream"], sensor["packets"]["accepted"], sensor["imu_packets"])
-        for sensor in report["sensors"]
-    }
-    imu = 1 if kind == "nonlegacy" else 0
-    assert found == {
-        "ouster_122239000672": ("169.254.238.111 > port 7502", 1, imu),
-        "ouster_122247000785": ("169.254.92.158 > port 7502", 1, imu),
-    }
-    assert report["unassigned"] == []
-
-
-@needs_recordings
-def test_extrinsics_files_of_the_vendor_are_no_metadata(convert: Convert) -> None:
-    folder = OUSTER / "os0-128_v2.3.0_rng15"
-    report = convert(str(folder / "OS-0-128-U1_v2.3.0_1024x10.pcap"))
-    assert _read(report) == {"ouster_122150000150": 64}
