@@ -10,15 +10,12 @@ import pytest
 
 from mlbatch.discovery.calibrations import find_calibrations
 from mlbatch.discovery.discover import Discovery, SensorSelection, discover
-from mlbatch.discovery.first_seconds import FirstSeconds
-from mlbatch.discovery.match import describe
-from mlbatch.errors import RecordingError, RigError, UsageError
+from mlbatch.errors import RigError
 from mlbatch.readers import open_recording
 from mlbatch.types import StreamTable
 from tests.builders.sessions import (
     SMALL,
     Unit,
-    twin,
     write_metadata,
     write_session,
 )
@@ -44,20 +41,6 @@ def test_sensors_without_a_serial_number_are_numbered(tmp_path: Path) -> None:
     assert [sensor.name for sensor in _discover(capture).sensors] == ["ouster_1"]
 
 
-def test_two_lidars_need_extrinsics_or_identity_on_request(tmp_path: Path) -> None:
-    known = Unit(spec=replace(SMALL, extrinsic_m=POSE))
-    capture = write_session(tmp_path, known, twin(Unit(), 222))
-    with pytest.raises(RigError, match="extrinsics unknown for ouster_222; required for every"):
-        _discover(capture)
-    found = _discover(capture, SensorSelection(identity_extrinsics=True))
-    assert [s.pose.source for s in found.sensors] == ["metadata", "identity"]
-    assert found.frame_id == "base_link"
-    # A single one may do without.
-    assert [s.name for s in _discover(capture, SensorSelection(only=("222",))).sensors] == [
-        "ouster_222"
-    ]
-
-
 def test_metadata_are_searched_in_the_folders_of_all_recordings(tmp_path: Path) -> None:
     first = tmp_path / "1"
     second = tmp_path / "2"
@@ -71,43 +54,12 @@ def test_metadata_are_searched_in_the_folders_of_all_recordings(tmp_path: Path) 
     assert len(examined) == 4
 
 
-def test_given_metadata_must_be_such(tmp_path: Path) -> None:
-    other = tmp_path / "other.json"
-    other.write_text("[1, 2]")
-    with pytest.raises(RigError, match=r"other\.json: expected the metadata or calibration"):
-        find_calibrations([tmp_path / "a.pcap"], [other])
-
-
 def test_an_unusable_file_in_the_directory_is_skipped(tmp_path: Path) -> None:
     """It was never named by the user; where it is named it is an error."""
     broken = write_metadata(tmp_path / "broken.json", replace(SMALL, altitude_deg=(1.0, 2.0)))
     assert find_calibrations([tmp_path / "a.pcap"], []) == ([], [broken])
     with pytest.raises(RigError, match=r"broken\.json"):
         find_calibrations([tmp_path / "a.pcap"], [broken])
-
-
-def test_unknown_packets_are_described(tmp_path: Path) -> None:
-    one = Unit()
-    capture = write_session(tmp_path, one, more=one.imu_records(2), metadata=False)
-    table = StreamTable()
-    sampler = FirstSeconds([open_recording(capture, table)], table).sampler
-    words = {kind.size: describe(sampler, kind) for kind in sampler.kinds}
-    assert words == {
-        1280: "Ouster lidar, serial 111, 1280 bytes: needs its metadata",
-        48: "Ouster IMU",
-    }
-    with pytest.raises(RecordingError, match="expected metadata that match, found none in"):
-        _discover(capture)
-
-
-def test_lidars_are_chosen_by_name_or_serial_number(tmp_path: Path) -> None:
-    capture = write_session(tmp_path, Unit(), twin(Unit(), 222))
-    for selection in (SensorSelection(only=("222",)), SensorSelection(ignore=("ouster_111",))):
-        found = _discover(capture, selection)
-        assert [sensor.name for sensor in found.sensors] == ["ouster_222"]
-        assert len(found.ignored.sensors) == 1
-    with pytest.raises(UsageError, match="one of ouster_111, ouster_222, found 'front'"):
-        _discover(capture, SensorSelection(only=("front",)))
 
 
 def test_warnings_of_a_decoder_become_notes(tmp_path: Path) -> None:

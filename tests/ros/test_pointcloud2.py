@@ -228,12 +228,6 @@ ONE = [(1, 2, 3, 9, 5, 4)]
 TIMES = (*XYZ, ("time", "float32"))
 SECONDS = (*XYZ, ("time", "float64"))
 MISTAKES: dict[str, tuple[bytes, str]] = {
-    "no time": (
-        cloud_message(OUSTER[:4], [(1, 2, 3, 9)]),
-        "expected the time of each point in a field t, time, timestamp, time_stamp, timestamps, "
-        "offset_time or ts, found x, y, z, intensity; none of them rises within the scan as "
-        "times do: record the raw packets, or clouds with times",
-    ),
     "no z": (
         cloud_message((*XYZ[:2], ("t", "uint32")), [(1, 2, 3)]),
         "expected fields x, y, z, found x, y, t; choose a topic of points",

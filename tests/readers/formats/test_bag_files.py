@@ -8,7 +8,6 @@ import sqlite3
 import struct
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any, cast
 
 import pytest
@@ -336,15 +335,7 @@ def test_a_message_in_a_page_that_is_cut_off_is_counted(tmp_path: Path) -> None:
 # -- refusals -------------------------------------------------------------------------------------
 
 
-def _database() -> bytes:
-    with TemporaryDirectory() as folder:
-        with sqlite3.connect(Path(folder) / "a") as connection:
-            connection.execute("CREATE TABLE other(a)")
-        connection.close()
-        return (Path(folder) / "a").read_bytes()
-
-
-# Files of a folder, and what is said of it; others are in tests/builders/bag_mistakes.py.
+# Files of a folder, and what is said of it; others are in tests/cli/cases/bags.txt.
 REFUSED: Mapping[str, tuple[bytes, str]] = {
     "a.mcap": (MAGIC[:7], "expected a recording"),
     "a.bag": (
@@ -352,11 +343,7 @@ REFUSED: Mapping[str, tuple[bytes, str]] = {
         "expected a bag of version 2.0 (#ROSBAG V2.0), found #ROSBAG V1.2; ",
     ),
     "b.bag": (_encrypted(), "; decrypt it with"),
-    "a.db3": (_database(), "expected a ROS 2 bag (tables topics and messages), found a database"),
-    "empty/a.db3": (b"", "found 0 bytes"),
-    "papers/a.txt": (b"", "found a folder without .db3 or .mcap files; name the files inside it"),
     "above/drive/a.pcapng": (b"", "found 1 folder(s) with recordings (drive); name "),
-    "text/a.db3": (b"no database", "check that it is the right file"),
     "capture/a.db3": (
         b"\xd4\xc3\xb2\xa1" + bytes(16) + b"\1\0\0\0",
         "expected the folder of a bag, found one with files of pcap",

@@ -263,7 +263,6 @@ def test_a_rig_with_sweeps_is_written_as_it_was_read(tmp_path: Path, points: str
 
 # -- mistakes -------------------------------------------------------------------------------------
 
-TIMELESS = {"x": "f4", "y": "f4", "z": "f4", "intensity": "f4"}
 NAME = f"{START_NS}.bin"
 
 
@@ -315,15 +314,6 @@ NAME = f"{START_NS}.bin"
          f"{NAME}: expected arrays of numbers, found others ("),
         ({NAME: _saved(**XYZ)[:-30]}, "{glob: top/*.bin}",
          f"{NAME}: expected arrays of numbers, found others ("),
-        # Points without a time: Complex Urban, KITTI, Lyft, nuPlan.
-        ({NAME: raw(TIMELESS, [point[:4] for point in POINTS])},
-         f"{{glob: top/*.bin, dtype: {dtype_text(TIMELESS)}}}",
-         "top/*.bin: expected the time of each point in a field t, time, timestamp, time_stamp, "
-         "timestamps, offset_time or ts, found x, y, z, intensity; none of them rises within"),
-        # One time for all points, as where a table was filled up.
-        ({f"{start}.bin": raw(FIELDS, [(*p[:4], 0, p[5]) for p in POINTS]) for start in _starts()},
-         GLOB, "field t (uint32): expected times of points that span about the spacing of the "
-         "messages (100.000 ms), found 0 for every point"),
     ],
 )  # fmt: skip
 def test_mistakes_are_one_line(
