@@ -139,7 +139,6 @@ SECONDS = (
     "rig/test_mistakes.py::test_any_text",
     "rig/test_rig.py::test_written_rigs",
     "ros/test_point_rows.py",
-    "ros/test_row_packer.py::test_clouds",
     "sensors/test_clocks.py::test_dates_of_the_encoder",
     "sensors/test_round_trip.py",
     "sensors/test_sensors.py::test_bytes_that_are_all",

@@ -1,6 +1,6 @@
 /* Points of decoded clouds: from the rows of a message to packets of columns.
 
-   Called by `ros/point_rows.py` and `ros/point_packets.py`, and by `ros/row_packer.py`. */
+   Called by `ros/point_rows.py` and `ros/point_packets.py`. */
 #include <math.h>
 #include <string.h>
 

@@ -1,16 +1,24 @@
-"""Rows of a decoded cloud to arrays: the points that have a place and a finite time."""
+"""Rows of decoded clouds by compiled loops (`native/clouds.c`): to arrays, or at once to packets.
+
+At once are clouds of a spinning lidar: a ring for each point, times that rise in a few runs, one
+lidar a message. The packets are those of `pointcloud2.read_cloud` and `point_packets.pack`, which
+read all other clouds.
+"""
 
 from __future__ import annotations
 
 import ctypes
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, TypeAlias
+from functools import lru_cache
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
 
-from mlbatch.arrays import F32Array
+from mlbatch.arrays import F32Array, I64Array, U8Array, U64Array
 from mlbatch.native.library import address, library
+from mlbatch.ros.point_packets import Layout, check_columns
 
 # A structured array, fields named by role; numpy has no type for the fields of a dtype.
 Rows: TypeAlias = npt.NDArray[Any]
@@ -76,3 +84,164 @@ def field_of(known: dict[str, Any], name: str) -> tuple[int, int]:
         return _NONE
     dtype, first = known[name][:2]
     return first, FIELD_NUMBERS[dtype.str[1:]]
+
+
+# -- at once --------------------------------------------------------------------------------------
+
+# In the order of `clouds.c`, and types that these fields may have; None: any.
+_ROLES = (*AXES, "intensity", "ring", "return_type", "tag")
+_TYPES: dict[str, tuple[str, ...]] = {
+    **dict.fromkeys(AXES, ("f4",)),
+    "ring": ("u1", "u2"),
+    "return_type": ("u1",),
+    "tag": ("u1",),
+    "time": ("i4", "u4", "f4", "f8"),
+}
+# As in `clouds.c`.
+_MOST_RUNS = 512
+# Distinct times of the points of a cloud that are followed.
+_MOST_TIMES = 1 << 15
+
+# Stamps (n,) of times (n,), and their meaning.
+Stamps: TypeAlias = Callable[[npt.NDArray[Any]], tuple[I64Array, str]]
+# Memory (packets, bytes) for packets, with any content.
+Room: TypeAlias = Callable[[int, int], U8Array]
+
+
+class PackedRows(NamedTuple):
+    """Packets (P, size) of a message; placed: rows with a place; points: placed rows with a time.
+
+    content_key: (P,) as `lidar.headers.content_keys`, None without factors.
+    """
+
+    packets: U8Array
+    content_key: I64Array | None
+    time_meaning: str
+    placed: int
+    points: int
+
+
+class _Form:
+    """Fields of rows of one dtype, for the loops; the arrays at `fields_at` and `types_at`.
+
+    is_usual: whether the loops read them; the others are only set if they do.
+    """
+
+    def __init__(self, dtype: np.dtype[Any]) -> None:
+        known = dict(dtype.fields or {})
+        self.dtype = dtype
+        self.is_usual = _is_usual(known)
+        if not self.is_usual:
+            return
+        fields = np.array([field_of(known, role) for role in _ROLES], np.int64)
+        self._arrays = fields.T.copy()
+        self.fields_at, self.types_at = map(address, self._arrays)
+        self.time_at, self.time_type = field_of(known, "time")
+        self.time_kind = known["time"][0]
+
+
+class RowPacker:
+    """Packs the rows of messages; its scratch arrays are used again."""
+
+    def __init__(self) -> None:
+        self._times: npt.NDArray[np.uint64] = np.empty(_MOST_TIMES, np.uint64)
+        self._number: npt.NDArray[np.int32] = np.empty(0, np.int32)
+        # By order, whether they are used, ranks, begins of runs; and figures.
+        self._scratch: tuple[npt.NDArray[Any], ...] = (
+            np.empty(_MOST_TIMES, np.int32),
+            np.empty(_MOST_TIMES, np.uint8),
+            np.empty(_MOST_TIMES + 1, np.int32),
+            np.empty(_MOST_RUNS + 1, np.int64),
+            np.empty(3, np.int64),
+        )
+        self._scratch_at = [address(one) for one in self._scratch]
+        self._times_at = address(self._times)
+        self._number_at = 0
+        self._form = _Form(np.dtype([]))
+
+    def pack(
+        self,
+        rows: Rows,
+        stamps: Stamps,
+        layout: Layout,
+        message_bytes: int,
+        room: Room,
+        factors: U64Array | None = None,
+    ) -> PackedRows | None:
+        """Packets of rows (n,) by ring; None where these are unusual. CloudError as `pack`.
+
+        factors: (layout.size // 8,) of their words in content keys, or None.
+        """
+        if not layout.by_ring or not len(rows):
+            return None
+        if rows.dtype is not self._form.dtype:
+            self._form = _Form(rows.dtype)
+        form = self._form
+        if not form.is_usual:
+            return None
+        loops = library()
+        if len(rows) > len(self._number):
+            self._number = np.empty(len(rows), np.int32)
+            self._number_at = address(self._number)
+        # Not by `__array_interface__`, which describes all fields.
+        rows_at = rows.ctypes.data
+        axes_at = form.fields_at
+        columns = loops.mlbatch_cloud_times(
+            len(rows),
+            rows_at,
+            rows.strides[0],
+            axes_at,
+            form.time_at,
+            form.time_type,
+            _MOST_TIMES,
+            self._times_at,
+            self._number_at,
+            *self._scratch_at,
+        )
+        placed, points, runs = self._scratch[-1].tolist()
+        # One time for all points is an error elsewhere.
+        if columns < 2:
+            return None
+        stamp_ns, meaning = stamps(self._times.view(form.time_kind)[:columns])
+        # Times in s may be the same in ns.
+        if not bool((stamp_ns[1:] > stamp_ns[:-1]).all()):
+            return None
+        check_columns(columns, points, layout, message_bytes)
+        packets = room(columns, layout.size)
+        content_key = np.empty(columns, np.int64)
+        head = _head_of(layout)
+        _, _, ranks_at, begins_at, _ = self._scratch_at
+        is_packed = loops.mlbatch_cloud_fill(
+            rows_at,
+            rows.strides[0],
+            axes_at,
+            form.types_at,
+            runs,
+            begins_at,
+            self._number_at,
+            ranks_at,
+            columns,
+            address(stamp_ns),
+            address(head),
+            layout.slots,
+            layout.size,
+            None if factors is None else address(factors),
+            address(packets),
+            address(content_key),
+        )
+        if not is_packed:
+            return None
+        known_key = None if factors is None else content_key
+        return PackedRows(packets, known_key, meaning, placed, points)
+
+
+@lru_cache(maxsize=16)
+def _head_of(layout: Layout) -> npt.NDArray[np.void]:
+    return layout.begin
+
+
+def _is_usual(known: dict[str, Any]) -> bool:
+    """Whether the loops read all fields of rows; of clouds of one lidar."""
+    if "lidar_id" in known or not {*AXES, "ring", "time"} <= known.keys():
+        return False
+    return all(known[role][0].str[1:] in types for role, types in _TYPES.items() if role in known)

@@ -65,7 +65,7 @@ from tests.reference.clouds import packets_of as cloud_packets
 from tests.reference.clouds import taken_rows
 
 if not trouble():
-    from mlbatch.ros.row_packer import RowPacker
+    from mlbatch.ros.point_rows import RowPacker
 
 # Mostly Ethernet.
 _LINKS = (1, 1, 1, 1, 1, 1, 101, 113, 276, 0)

@@ -19,9 +19,9 @@ from mlbatch.lidar.headers import hash_factors
 from mlbatch.native.arena import PacketArena
 from mlbatch.readers.bag.cloud_topics import CloudTopics
 from mlbatch.ros.point_packets import HEAD, CloudError, Points, layout_of, pack
+from mlbatch.ros.point_rows import PackedRows, RowPacker
 from mlbatch.ros.point_times import stamps
 from mlbatch.ros.pointcloud2 import CLOUD_TYPES, Cloud, raw_cloud, read_cloud
-from mlbatch.ros.row_packer import PackedRows, RowPacker
 from mlbatch.types import (
     Message,
     PacketBatch,
