@@ -19,6 +19,7 @@ from mlbatch.readers import open_recording
 from mlbatch.readers.bag.packet_messages import PacketsFound, Unpacker
 from mlbatch.ros.encoding import MessageError
 from mlbatch.types import StreamTable, Topic
+from tests.builders import reading
 from tests.builders.two_lidars import FOLDER, LEFT, RIGHT, FixtureLidar
 
 OUSTER_ROS1 = "ouster_ros/PacketMsg"
@@ -162,7 +163,7 @@ def definition(type_name: str, encoding: str) -> str:
     return main + "".join(f"{BREAK}\nMSG: {name}\n{text}" for name, text in parts.items())
 
 
-def packets_in(topic: Topic, data: U8Array, begin: int, end: int, log_ns: int = 0) -> PacketsFound:
+def found_in(topic: Topic, data: U8Array, begin: int, end: int, log_ns: int = 0) -> PacketsFound:
     """What is found in the message `data[begin:end]`; MessageError if it cannot be read."""
     places = (np.array([value], np.int64) for value in (begin, end, log_ns))
     found = Unpacker(topic).find_many(data, *places)
@@ -179,12 +180,11 @@ def fixture_packets() -> tuple[tuple[str, int, bytes], ...]:
     table = StreamTable()
     found = []
     for batch in open_recording(FOLDER / "two_lidars.pcap", table).packets():
-        columns = (batch.start, batch.size, batch.stream, batch.host_ns)
-        for start, size, number, host_ns in zip(*(c.tolist() for c in columns), strict=True):
+        for number, host_ns, payload in reading.packets_in(batch):
             stream = table.streams[number]
             if stream.source_ip in names and stream.port in tails:
                 topic = f"/{names[stream.source_ip]}/ouster/{tails[stream.port]}"
-                found.append((topic, host_ns, batch.data[start : start + size].tobytes()))
+                found.append((topic, host_ns, payload))
     return tuple(found)
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import socket
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -68,12 +68,18 @@ def refusal(path: Path) -> str:
     return line
 
 
+def packets_in(batch: PacketBatch) -> Iterator[tuple[int, int, bytes]]:
+    """Number of the stream, receive time and payload of each packet of a batch."""
+    columns = (batch.start, batch.size, batch.stream, batch.host_ns)
+    for start, size, stream, host_ns in zip(*(c.tolist() for c in columns), strict=True):
+        yield stream, host_ns, batch.data[start : start + size].tobytes()
+
+
 def seen_of(batch: PacketBatch, streams: StreamTable) -> list[Seen]:
     """The packets of a batch."""
-    columns = (batch.start, batch.size, batch.stream, batch.host_ns)
     return [
-        Seen(host_ns, str(streams.streams[stream]), batch.data[start : start + size].tobytes())
-        for start, size, stream, host_ns in zip(*(c.tolist() for c in columns), strict=True)
+        Seen(host_ns, str(streams.streams[stream]), payload)
+        for stream, host_ns, payload in packets_in(batch)
     ]
 
 

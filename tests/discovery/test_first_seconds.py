@@ -14,6 +14,7 @@ from mlbatch.discovery.first_seconds import FirstSeconds, is_without_packets
 from mlbatch.readers import open_recording
 from mlbatch.readers.capture.recording import CaptureRecording
 from mlbatch.types import PacketBatch, StreamTable
+from tests.builders.reading import packets_in
 from tests.builders.sessions import FIXTURE, Shell, Unit, twin, write_session
 
 CAPTURE = FIXTURE / "two_lidars.pcap"
@@ -27,13 +28,7 @@ def _first(path: Path) -> FirstSeconds:
 
 
 def _payloads(batches: Generator[PacketBatch, None, None]) -> Payloads:
-    return [
-        (int(batch.host_ns[row]), batch.data[start : start + size].tobytes())
-        for batch in batches
-        for row, (start, size) in enumerate(
-            zip(batch.start.tolist(), batch.size.tolist(), strict=True)
-        )
-    ]
+    return [one[1:] for batch in batches for one in packets_in(batch)]
 
 
 @pytest.mark.parametrize(

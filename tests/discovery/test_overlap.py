@@ -13,6 +13,7 @@ from mlbatch.discovery.overlap import LidarSpan, iso, problem
 from mlbatch.readers import open_recording
 from mlbatch.types import StreamTable
 from tests.builders.captures import udp_frame, write_pcap
+from tests.builders.reading import packets_in
 from tests.builders.sessions import (
     EPOCH_NS,
     NS_PER_MS,
@@ -87,12 +88,7 @@ def test_the_end_of_a_capture_is_known_without_reading_it(shell: Shell, tmp_path
     assert path.stat().st_size > 1_500_000
     payloads = unit.payloads[-len(last) :]
     assert 700 < len(last) < len(unit.payloads)
-    assert last.host_ns.tolist() == [host_ns for host_ns, _ in payloads]
-    found = [
-        last.data[begin : begin + size].tobytes()
-        for begin, size in zip(last.start.tolist(), last.size.tolist(), strict=True)
-    ]
-    assert found == [payload for _, payload in payloads]
+    assert [one[1:] for one in packets_in(last)] == payloads
     # `inspect` reads 10 s, and shows what it knows.
     write_metadata(tmp_path / "111.json", unit.spec)
     right = _capture(tmp_path / "right.pcap", replace(LATER, turns=1).records)

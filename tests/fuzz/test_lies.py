@@ -17,7 +17,7 @@ from mlbatch.readers.bag.packet_messages import Unpacker
 from mlbatch.rig.rig import read_rig
 from mlbatch.ros.messages import decode_transforms
 from mlbatch.types import StreamTable, Topic
-from tests.builders.bags import Recorded, packet_message, packets_in
+from tests.builders.bags import Recorded, found_in, packet_message
 from tests.builders.rosbag2 import Form, write_folder, write_rosbag2
 from tests.builders.run import command
 from tests.fuzz import packets
@@ -61,7 +61,7 @@ def test_definitions_may_not_take_for_ever(name: str) -> None:
             topic = Topic("/a", OUSTER, encoding, data.decode(), "ros2msg")
             array = np.frombuffer(packet_message(encoding, bytes(64)) + bytes(128), np.uint8)
             try:
-                packets_in(topic, array, 0, len(array) - 128)
+                found_in(topic, array, 0, len(array) - 128)
             except RecordingError:
                 continue
 
@@ -83,7 +83,7 @@ def test_idl_that_never_ends_is_passed_over(text: str) -> None:
     def run(data: bytes, folder: Path) -> None:
         topic = Topic("/a", "velodyne_msgs/VelodyneScan", "cdr", data.decode(), "ros2idl")
         with pytest.raises(RecordingError):
-            packets_in(topic, np.zeros(200, np.uint8), 0, 70)
+            found_in(topic, np.zeros(200, np.uint8), 0, 70)
 
     check([text.encode()], run)
 

@@ -7,7 +7,6 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 import pytest
 
 from mlbatch.readers import merge, open_recording
@@ -28,6 +27,7 @@ from tests.builders.points import (
     read_packets,
     write_points,
 )
+from tests.builders.reading import packets_in
 from tests.builders.rosbag1 import write_rosbag1
 from tests.builders.rosbag2 import write_rosbag2
 
@@ -45,18 +45,7 @@ def _open(path: Path) -> tuple[CloudRecording, StreamTable]:
 
 def _payloads(batches: Iterator[PacketBatch]) -> list[tuple[int, int, bytes]]:
     """Stream, receive time and bytes of all packets."""
-    found = []
-    for batch in batches:
-        rows = zip(*(a.tolist() for a in _of(batch)), strict=True)
-        found += [
-            (stream, host_ns, batch.data[start : start + size].tobytes())
-            for start, size, stream, host_ns in rows
-        ]
-    return found
-
-
-def _of(batch: PacketBatch) -> tuple[npt.NDArray[np.int64], ...]:
-    return batch.start, batch.size, batch.stream, batch.host_ns
+    return [packet for batch in batches for packet in packets_in(batch)]
 
 
 def _sweep(number: int) -> bytes:

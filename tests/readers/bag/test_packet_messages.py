@@ -19,7 +19,7 @@ from mlbatch.ros.definitions import definition_text
 from mlbatch.ros.encoding import MessageError
 from mlbatch.ros.packet_types import PACKET_TYPES
 from mlbatch.types import Topic
-from tests.builders.bags import Body, packets_in
+from tests.builders.bags import Body, found_in
 
 S = 1_000_000_000
 STAMP_NS, LOG_NS = 1_700_000_000 * S + 123_456_789, 1_700_000_001 * S
@@ -128,7 +128,7 @@ def payloads(name: str, count: int) -> list[bytes]:
 def find(topic: Topic, data: bytes, pad: int = 0) -> tuple[PacketsFound, list[bytes]]:
     """What is found in a message that begins at byte `pad` of an array, and the payloads."""
     array: U8Array = np.frombuffer(bytes(pad) + data + bytes(3), np.uint8)
-    found = packets_in(topic, array, pad, pad + len(data), LOG_NS)
+    found = found_in(topic, array, pad, pad + len(data), LOG_NS)
     return found, cut(array, found)
 
 
@@ -341,7 +341,7 @@ def test_many_messages_give_what_they_give_one_by_one() -> None:
     for number in range(len(messages)):
         if number not in (6, 7):
             places = int(begin[number]), int(end[number]), int(log_ns[number])
-            one = packets_in(topic, data, *places)
+            one = found_in(topic, data, *places)
             rows = zip(one.start.tolist(), one.size.tolist(), one.host_ns.tolist(), strict=True)
             expected += [(number, *row) for row in rows]
     columns = (together.message, together.start, together.size, together.host_ns)
