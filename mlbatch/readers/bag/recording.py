@@ -79,9 +79,10 @@ class BagRecording(Recording):
             self.topics = (*self.topics, topic)
         return number
 
-    def lose(self, note: str, count: int = 1) -> None:
-        """Note what cannot be read, and count `count` messages of it as truncated."""
-        if len(self.notes) < MOST_NOTES or isinstance(note, CutOff):
+    def lose(self, note: str = "", count: int = 1) -> None:
+        """Note once what cannot be read, and count `count` messages of it as truncated."""
+        has_room = len(self.notes) < MOST_NOTES or isinstance(note, CutOff)
+        if note and has_room and note not in self.notes:
             self.notes.append(note)
         self.counts.frames += count
         self.counts.skip("truncated", count)

@@ -176,8 +176,7 @@ def _report(recording: BagRecording, walk: Walk, file: Path | None) -> None:
     name = "" if file is None else f"{file.name}: "
     # A note that the file was cut off remains one.
     recording.notes += [type(note)(name + note) for note in walk.notes]
-    recording.counts.frames += walk.lost
-    recording.counts.skip("truncated", walk.lost)
+    recording.lose(count=walk.lost)
 
 
 @dataclass(slots=True)

@@ -14,7 +14,6 @@ import sqlite3
 import tempfile
 import weakref
 from collections.abc import Generator, Iterator, Sequence
-from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 
@@ -112,31 +111,13 @@ def _portions(
             for number, topic in database.topics.items()
             if recording.selects(topic)
         }
-        damage = _Damage()
         read = 0
-        for portion in database.portions(numbers, buffer, damage):
+        for portion in database.portions(numbers, buffer, recording):
             read += int((portion.end - portion.begin).sum())
             recording.position_bytes = before + min(read, database.size_bytes)
             yield portion
         before += database.size_bytes
         recording.position_bytes = before
-        recording.notes += damage.notes
-        recording.counts.frames += damage.lost
-        recording.counts.skip("truncated", damage.lost)
-
-
-@dataclass(slots=True)
-class _Damage:
-    """One line for each problem while reading, and the number of messages lost."""
-
-    notes: list[str] = field(default_factory=list)
-    lost: int = 0
-
-    def add(self, note: str, lost: int = 1) -> None:
-        """Note a loss."""
-        if note not in self.notes:
-            self.notes.append(note)
-        self.lost += lost
 
 
 class _Database:
@@ -244,11 +225,11 @@ class _Database:
         return frozenset()
 
     def portions(
-        self, numbers: dict[int, int], buffer: U8Array, damage: _Damage
+        self, numbers: dict[int, int], buffer: U8Array, recording: BagRecording
     ) -> Generator[Portion, None, None]:
         """Messages of the topics `numbers` (this file's number: the recording's) in `buffer`.
 
-        A damaged database is read as far as possible.
+        A damaged database is read as far as possible; the recording counts what is lost.
         """
         if not numbers:
             return
@@ -257,7 +238,7 @@ class _Database:
         by_id = _BY_ID.format(marks)
         query = _BY_TIME.format(marks) if self._indexed else by_id
         with contextlib.closing(self._connect()) as connection:
-            page = _Page(name, numbers, buffer, damage, self._cut)
+            page = _Page(name, numbers, buffer, recording, self._cut)
             has_more = True
             while has_more:
                 try:
@@ -267,11 +248,11 @@ class _Database:
                     has_more = query != by_id
                     if has_more:
                         note = f"{name}: {err}; messages come in the order of recording"
-                        damage.add(note, lost=0)
+                        recording.lose(note, 0)
                         query = by_id
                     else:
                         note = f"{name}: {err}; the rest of the file was not read"
-                        damage.add(CutOff(note))
+                        recording.lose(CutOff(note))
                 if page.rows:
                     yield page.portion()
 
@@ -284,7 +265,7 @@ class _Page:
         name: str,
         numbers: dict[int, int],
         buffer: U8Array,
-        damage: _Damage,
+        recording: BagRecording,
         cut: frozenset[int],
     ) -> None:
         """cut: numbers of messages that are not whole."""
@@ -293,7 +274,7 @@ class _Page:
         self._name = name
         self._numbers = numbers
         self._buffer = buffer
-        self._damage = damage
+        self._recording = recording
         self._cut = cut
         # Time and number of the last message read, of all portions.
         self._last = _BEFORE_ALL
@@ -310,11 +291,11 @@ class _Page:
             with contextlib.closing(connection.execute(query, last)) as cursor:
                 for number, topic, log_ns, data in cursor:
                     if not isinstance(data, bytes) or not isinstance(log_ns, int):
-                        self._damage.add(f"{self._name}: a message without bytes or time")
+                        self._recording.lose(f"{self._name}: a message without bytes or time")
                         last = (last[0], number)
                         continue
                     if number in self._cut:
-                        self._damage.lost += 1
+                        self._recording.lose()
                         last = (log_ns, number)
                         continue
                     if data.startswith(ZSTD_MAGIC):
