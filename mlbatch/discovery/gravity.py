@@ -33,7 +33,7 @@ def gravity_notes(
     vertical = vertical_of(body_frame)
     for sensor, up in ups(sampler, router, sensors):
         tilted_deg = tilt_deg(up, np.array(vertical))
-        if tilted_deg <= MOST_TILT_DEG:
+        if not sensor.pose.is_known or tilted_deg <= MOST_TILT_DEG:
             continue
         axis = " ".join(f"{value:g}" for value in vertical)
         found = " ".join(f"{round(value, 2) + 0.0:.2f}" for value in up.tolist())
@@ -58,12 +58,12 @@ def ups(
     sensors: Sequence[DetectedSensor],
     mean: Callable[[Sequence[ImuSamples]], F64Array | None] = mean_gravity,
 ) -> Iterator[tuple[DetectedSensor, F64Array]]:
-    """Sensors with pose and IMU, and up (3,) by its gravity in the first seconds, body frame.
+    """Sensors with an IMU, and up (3,) by its gravity in the first seconds, body frame.
 
     mean: of the samples, IMU frame.
     """
     for number, sensor in enumerate(sensors):
-        sensor_from_imu = sensor.lidar.sensor_from_imu() if sensor.pose.is_known else None
+        sensor_from_imu = sensor.lidar.sensor_from_imu()
         parts = list(_samples(sampler, router, number, sensor))
         if sensor_from_imu is None or not parts:
             continue

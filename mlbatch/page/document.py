@@ -121,6 +121,8 @@ def _verdict(report: RunReport, found: list[Finding], windows: Windows | None) -
     if report.recorded_s:
         summary += f", from {_seconds(report.recorded_s)} of recording"
     summary += f". {_loss_words(sensors)}"
+    if any(warned.code == "clouds" for warned in report.warnings):
+        summary += " Lost clouds are not counted; scans that lack columns are."
     if windows is not None:
         start = describe_time(int(windows.start_ns[0]), report.timescale)
         summary += f" First scan at {start}."

@@ -258,9 +258,13 @@ def _loss_notes(run: Conversion) -> Iterator[Note]:
         lacking = 0 if scans is None else scans.underfilled_by_sensor.get(sensor.name, 0)
         if scans is not None and lacking:
             without = scans.without.get(sensor.name, 0)
+            # Of a sensor whose rate is unknown, what is usual is only known after the run.
+            what, remedy = ("columns", "; --drop-incomplete leaves them out")
+            if not sensor.lidar.columns_per_s:
+                what, remedy = ("usual columns", "")
             texts.append(
-                f"{lacking} of {scans.written} scans have less than half of its columns, {without} "
-                "have none; --drop-incomplete leaves them out"
+                f"{lacking} of {scans.written} scans have less than half of its {what}, {without} "
+                f"have none{remedy}"
             )
         if texts:
             yield Note("loss", sensor.name, f"{sensor.name}: {'; '.join(texts)}")

@@ -9,14 +9,14 @@ import tempfile
 import weakref
 from array import array
 from collections.abc import Sequence
-from dataclasses import dataclass
-from functools import lru_cache
+from dataclasses import dataclass, field
+from functools import lru_cache, partial
 from operator import add
 from typing import NamedTuple
 
 import numpy as np
 
-from mlbatch.arrays import F64Array
+from mlbatch.arrays import BoolArray, F64Array, I64Array, median
 from mlbatch.errors import ExportError
 from mlbatch.types import RunInfo, Scan
 from mlbatch.units import NS_PER_MS, NS_PER_S
@@ -50,8 +50,8 @@ class ScanStatistics(NamedTuple):
     empty: int
     incomplete: int
     dropped_incomplete: int
-    # Scans with less than half of the columns of a sensor. Neither the head nor the tail, which are
-    # partial, counts in this and the following.
+    # Scans with less than half of the columns of a sensor, or of its usual ones where its rate is
+    # unknown. Neither the head nor the tail, which are partial, counts in this and the following.
     underfilled: int
     # By sensor: scans with less than half of its columns, without any, with columns but no points.
     underfilled_by_sensor: dict[str, int]
@@ -87,7 +87,8 @@ class ScanTable:
         self._points = 0
         self._empty_clouds = 0
         self._totals = [_SensorTotals(sensor.name) for sensor in info.sensors]
-        self._underfilled = 0
+        # Of each scan that is not partial: whether a fill is too low.
+        self._low = bytearray()
         names = [sensor.name for sensor in info.sensors]
         start = ["index", "slice", "start_ns", "end_ns", "first_stamp_ns", "last_stamp_ns"]
         counts = ["points", "columns", *(f"columns_{name}" for name in names), "complete"]
@@ -138,13 +139,19 @@ class ScanTable:
         Neither are written.
         """
         self._format()
+        low: BoolArray = np.array(self._low, np.bool_)
+        underfilled = {one.name: one.underfilled for one in self._totals}
+        for one in self._totals:
+            scans = one.unusual()
+            underfilled[one.name] += len(scans)
+            low[scans] = True
         return ScanStatistics(
             self._written,
             empty,
             self._incomplete,
             dropped_incomplete,
-            self._underfilled,
-            _counted({one.name: one.underfilled for one in self._totals}),
+            int(np.count_nonzero(low)),
+            _counted(underfilled),
             _counted({one.name: one.without for one in self._totals}),
             _counted({one.name: one.no_points for one in self._totals}),
             self._empty_clouds,
@@ -191,9 +198,9 @@ class ScanTable:
         is_underfilled = False
         filled = zip(self._totals, row.columns, row.points_of, row.fill, strict=True)
         for one, columns, points, fill in filled:
-            one.add(columns, points if row.is_listed else None, fill)
+            one.add(len(self._low), columns, points if row.is_listed else None, fill)
             is_underfilled |= fill < UNDERFILLED
-        self._underfilled += is_underfilled
+        self._low.append(is_underfilled)
 
     def _append(self, text: str) -> None:
         try:
@@ -215,15 +222,29 @@ class _SensorTotals:
     no_points: int = 0
     known: int = 0  # scans whose fill is known
     fill: float = 0.0  # sum over them
+    # Numbers and columns of scans whose fill is unknown.
+    _scans: array[int] = field(default_factory=partial(array, "q"))
+    _columns: array[int] = field(default_factory=partial(array, "q"))
 
-    def add(self, columns: int, points: int | None, fill: float) -> None:
-        """points: None if unknown."""
+    def add(self, scan: int, columns: int, points: int | None, fill: float) -> None:
+        """scan: its number; points: None if unknown."""
         self.without += not columns
         self.no_points += bool(columns) and points == 0
         self.underfilled += fill < UNDERFILLED
         if not math.isnan(fill):
             self.known += 1
             self.fill += fill
+        elif columns:
+            self._scans.append(scan)
+            self._columns.append(columns)
+
+    def unusual(self) -> I64Array:
+        """Scans of unknown fill that have less than half of the usual columns: a lost sweep."""
+        if not self._columns:
+            return np.zeros(0, np.int64)
+        columns = np.array(self._columns, np.int64)
+        found: I64Array = np.array(self._scans, np.int64)[columns < UNDERFILLED * median(columns)]
+        return found
 
     @property
     def mean_fill(self) -> float | None:

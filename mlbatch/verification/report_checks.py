@@ -450,25 +450,41 @@ def _check_fill(report: Document, table: Table) -> None:
     if table.fill is None:
         return
     whole = table.index >= 0
-    low = np.any(table.fill < _UNDERFILLED, axis=1) & whole
-    _check_count(report, low, "underfilled")
-    for name in ("without", "underfilled_by_sensor"):
+    # The last one may not count, nor for what is usual.
+    ends = whole.copy()
+    ends[-1:] = False
+    most, least = (_lacking(table, table.fill, rows) for rows in (whole, ends))
+    any_most, any_least = (np.logical_or.reduce(lacking, axis=1) for lacking in (most, least))
+    _check_count(report, any_most, any_least, "underfilled")
+    none = table.columns_of == 0
+    for name, more, fewer in (
+        ("without", none & whole[:, None], none & ends[:, None]),
+        ("underfilled_by_sensor", most, least),
+    ):
         said = report.counts("scans", name)
         for i, sensor in enumerate(table.sensors):
-            none = table.columns_of[:, i] == 0
-            lacking = none if name == "without" else table.fill[:, i] < _UNDERFILLED
-            if sensor in said or (lacking & whole)[:-1].any():
-                _check_count(report, lacking & whole, name, sensor)
+            if sensor in said or fewer[:, i].any():
+                _check_count(report, more[:, i], fewer[:, i], name, sensor)
 
 
-def _check_count(report: Document, rows: BoolArray, *path: str) -> None:
-    """Check a number of rows, in which the last one may not count."""
+def _lacking(table: Table, fill: F64Array, rows: BoolArray) -> BoolArray:
+    """Which of some scans (r,) lack columns of a sensor (r, s): by fill, or the usual number."""
+    lacking = fill < _UNDERFILLED
+    unsure = np.isnan(fill) & (table.columns_of > 0) & rows[:, None]
+    for i in np.flatnonzero(unsure.any(axis=0)).tolist():
+        columns = table.columns_of[:, i]
+        lacking[:, i] |= unsure[:, i] & (columns < _UNDERFILLED * np.median(columns[unsure[:, i]]))
+    found: BoolArray = lacking & rows[:, None]
+    return found
+
+
+def _check_count(report: Document, most: BoolArray, least: BoolArray, *path: str) -> None:
+    """Check a number of scans: at least and at most so many."""
     said = report.number("scans", *path)
-    most = int(np.count_nonzero(rows))
-    least = int(np.count_nonzero(rows[:-1]))
+    lowest, highest = sorted(int(np.count_nonzero(rows)) for rows in (most, least))
     report.log.ok("report")
-    if said is not None and not least <= said <= most:
-        report.log.fail("report", report.name("scans", *path), most, said)
+    if said is not None and not lowest <= said <= highest:
+        report.log.fail("report", report.name("scans", *path), highest, said)
 
 
 def _check_windows(report: Document, table: Table, grid: Grid) -> None:

@@ -13,6 +13,9 @@ import numpy as np
 import pytest
 
 import mlbatch
+from mlbatch.discovery.gravity import ups
+from mlbatch.pipeline.conversion import Conversion
+from mlbatch.pipeline.job import Job, SensorSelection
 from mlbatch.poses.calibration import Calibration
 from mlbatch.rig.rig import read_rig
 from tests.builders.sessions import REPOSITORY, Shell
@@ -135,3 +138,13 @@ def test_the_imu_of_the_first_lidar_says_that_it_is_not_level(shell: Shell) -> N
     assert [float(angle) for angle in found[2].split(",")] == pytest.approx([0, 10, 80], abs=0.5)
     _guess()
     assert json.loads(shell(f"calibrate {DRIVE} --rig guess.yaml --json").out)["level"] == ""
+
+
+def test_an_imu_says_how_its_lidar_lies_where_no_pose_is_known() -> None:
+    """As in a calibration by motion: the pitch of 10 degrees is seen at the body's origin."""
+    job = Job((DRIVE,), SensorSelection(identity_extrinsics=True))
+    setup = Conversion(job).session.setup
+    seen = {one.name: up for one, up in ups(setup.sampler, setup.router, setup.sensors)}
+    (up,) = (up for name, up in seen.items() if "left" in name)
+    pitch_deg = np.rad2deg(np.arctan2(-up[0], up[2]))
+    assert pitch_deg == pytest.approx(10.0, abs=0.5)

@@ -95,6 +95,27 @@ def test_points_are_at_the_time_of_the_name_and_their_own(shell: Shell) -> None:
     assert shell("verify out").code == 0
 
 
+def test_a_lost_sweep_leaves_scans_that_lack_its_columns(shell: Shell) -> None:
+    """The sweep of 537 to 635 ms is lost: window 5 keeps 37 of 98 columns, window 6 keeps 61."""
+    rows = [f"- name: {name}\n  points: {GLOB.replace('top', name)}\n" for name in ("top", "rear")]
+    poses = "  extrinsics: {{translation_m: [{}, 0, 1]}}\n"
+    Path("rig.yaml").write_text(f"sensors:\n{rows[0]}{poses.format(0)}{rows[1]}{poses.format(1)}")
+    for name, phase, lost in (("top", 0, ()), ("rear", 37 * MS, (5,))):
+        starts = (
+            START_NS + number * 100 * MS + phase for number in range(10) if number not in lost
+        )
+        write_sweeps(Path("drive") / name, {f"{at}.bin": raw(FIELDS, POINTS) for at in starts})
+    outcome = shell("convert drive --rig rig.yaml -o out --fail-on underfilled>0")
+    assert outcome.code == 3
+    assert "rear: 1 of 9 scans have less than half of its usual columns, 0 have none" in outcome.err
+    report = json.loads(Path("out/report.json").read_text())
+    assert report["scans"]["underfilled_by_sensor"] == {"rear": 1}
+    assert shell("verify out").code == 0
+    report["scans"]["underfilled_by_sensor"] = {"rear": 2}
+    Path("out/report.json").write_text(json.dumps(report))
+    assert shell("verify out").code == 1
+
+
 def _pcds(data: str) -> dict[str, bytes]:
     return {f"{start}.pcd": pcd(FIELDS, POINTS, data) for start in _starts()}
 
