@@ -25,7 +25,12 @@ def check_options(options: Mapping[str, str]) -> None:
     for key, value in options.items():
         if key not in DECODE_OPTIONS:
             known = ", ".join(DECODE_OPTIONS)
-            raise UsageError(f"--decode {key}={value}: expected one of {known}, found {key}")
-        if value not in DECODE_OPTIONS[key]:
-            expected = " or ".join(f"{key}={choice}" for choice in DECODE_OPTIONS[key])
-            raise UsageError(f"--decode {key}={value}: expected {expected}, found {value}")
+            raise UsageError(
+                f"--decode: expected one of {known}, found {key!r}; write --decode crc=check"
+            )
+        choices = DECODE_OPTIONS[key]
+        if value not in choices:
+            raise UsageError(
+                f"--decode {key}: expected {' or '.join(choices)}, found {value!r}; write --decode "
+                f"{key}={choices[0]}"
+            )

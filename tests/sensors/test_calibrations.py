@@ -482,10 +482,10 @@ def test_angles_of_a_robosense_are_asked_for(name: str, difops: list[bytes], fou
     [
         (
             {"colour": "red"},
-            "--decode colour=red: expected one of crc, firing_azimuth, optical_cen",
+            "--decode: expected one of crc, firing_azimuth, optical_cen",
         ),
-        ({"vertical_offset": "up"}, "vertical_offset=on or vertical_offset=off, found up"),
-        ({"crc": "never"}, "expected crc=check, found never"),
+        ({"vertical_offset": "up"}, "--decode vertical_offset: expected on or off, found 'up'"),
+        ({"crc": "never"}, "--decode crc: expected check, found 'never'"),
     ],
 )
 @pytest.mark.parametrize(
