@@ -13,9 +13,10 @@ import numpy as np
 import pytest
 
 import mlbatch
+from mlbatch.discovery.discover import SensorSelection
 from mlbatch.discovery.gravity import ups
 from mlbatch.pipeline.conversion import Conversion
-from mlbatch.pipeline.job import Job, SensorSelection
+from mlbatch.pipeline.job import Job
 from mlbatch.poses.calibration import Calibration
 from mlbatch.rig.rig import read_rig
 from tests.builders.sessions import REPOSITORY, Shell
