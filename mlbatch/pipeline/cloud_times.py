@@ -163,7 +163,12 @@ class CloudTimes:
             ),
             None,
         )
-        found = []
+        few = f"less than 3 sweeps with {_FEWEST_POINTS} points within {_FARTHEST_M:g} m"
+        found = [
+            TimeFinding(lidar.sensor.name, OPEN, few)
+            for lidar in self._lidars
+            if lidar not in lidars
+        ]
         for number, (lidar, order) in enumerate(zip(lidars, orders, strict=True)):
             delay: DelayFit | None = None
             if reference not in (None, number) and len(lidars) > 1:
