@@ -15,6 +15,10 @@ from mlbatch.units import NS_PER_MS
 if TYPE_CHECKING:
     from mlbatch.native.arena import PacketArena
 
+# Models of decoded clouds, by the number of their source in packets of points; their rate is
+# unknown.
+CLOUDS = ("PointCloud2", "CustomMsg")
+
 
 class Stream(NamedTuple):
     """Origin of packets: a (source IP, destination port) of a capture, or a topic of a bag.

@@ -13,7 +13,7 @@ from mlbatch.page.windows import Windows
 from mlbatch.page.words import MEANINGS
 from mlbatch.reports.ledger import SensorLedger
 from mlbatch.reports.report import RunReport
-from mlbatch.ros.point_packets import KINDS
+from mlbatch.types import CLOUDS
 
 _NETWORK = (
     "check network, switch and capture buffers (tcpdump -B, net.core.rmem_max), and the speed of "
@@ -121,7 +121,7 @@ def verdict(found: list[Finding], report: RunReport) -> tuple[Level, str, str]:
         # Where lidars are, no packet says: the heading names what was compared.
         covered = "poses not checked" if report.poses is None else report.poses.describe()
         fine = _FINE
-        if any(sensor.model in KINDS for sensor in report.sensors):
+        if any(sensor.model in CLOUDS for sensor in report.sensors):
             fine = "Windows are fine; clocks and times of decoded clouds not measured"
         return Level.GOOD, f"{fine}; {covered}", ""
     problems = sum(one.level == Level.PROBLEM for one in found)

@@ -31,9 +31,9 @@ from mlbatch.poses.point_times import (
     track,
 )
 from mlbatch.poses.solve import Cloud
-from mlbatch.ros.point_packets import HEAD, KINDS
+from mlbatch.ros.point_packets import HEAD
 from mlbatch.ros.point_times import BACK, END, START
-from mlbatch.types import PacketBatch
+from mlbatch.types import CLOUDS, PacketBatch
 from mlbatch.units import NS_PER_S
 
 # Sweeps of a lidar that are kept, the last ones; points of each, about.
@@ -134,7 +134,7 @@ class CloudTimes:
         self._lidars = [
             _Lidar(sensor)
             for sensor in discovery.sensors
-            if sensor.lidar.model in KINDS and (sensor.rig is None or sensor.rig.epoch is None)
+            if sensor.lidar.model in CLOUDS and (sensor.rig is None or sensor.rig.epoch is None)
         ]
 
     def add(self, batch: PacketBatch) -> None:

@@ -18,7 +18,7 @@ import numpy as np
 
 from mlbatch.arrays import BoolArray, F64Array, I64Array, median
 from mlbatch.errors import ExportError
-from mlbatch.types import RunInfo, Scan
+from mlbatch.types import CLOUDS, RunInfo, Scan
 from mlbatch.units import NS_PER_MS, NS_PER_S
 
 # A number in every reader of CSV: a column of empty cells would be one of texts.
@@ -86,7 +86,7 @@ class ScanTable:
         self._incomplete = 0
         self._points = 0
         self._empty_clouds = 0
-        self._totals = [_SensorTotals(sensor.name) for sensor in info.sensors]
+        self._totals = [_SensorTotals(sensor.name, sensor.model) for sensor in info.sensors]
         # Of each scan that is not partial: whether a fill is too low.
         self._low = bytearray()
         names = [sensor.name for sensor in info.sensors]
@@ -217,6 +217,7 @@ class _SensorTotals:
     """Sums of one sensor over scans that are not partial."""
 
     name: str
+    model: str
     underfilled: int = 0
     without: int = 0
     no_points: int = 0
@@ -239,8 +240,11 @@ class _SensorTotals:
             self._columns.append(columns)
 
     def unusual(self) -> I64Array:
-        """Scans of unknown fill that have less than half of the usual columns: a lost sweep."""
-        if not self._columns:
+        """Scans of unknown fill that have less than half of the usual columns: a lost sweep.
+
+        Only of decoded clouds: other lidars measure less in some scans by their mode.
+        """
+        if self.model not in CLOUDS or not self._columns:
             return np.zeros(0, np.int64)
         columns = np.array(self._columns, np.int64)
         found: I64Array = np.array(self._scans, np.int64)[columns < UNDERFILLED * median(columns)]

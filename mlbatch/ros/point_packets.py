@@ -20,8 +20,6 @@ from mlbatch.arrays import BoolArray, F32Array, I64Array, U8Array, U16Array
 from mlbatch.errors import RecordingError
 from mlbatch.native.library import address, library
 
-# Source of the points, by its number in packets.
-KINDS = ("PointCloud2", "CustomMsg")
 MAGIC = int.from_bytes(b"MLPC", "little")
 VERSION = 1
 WITH_LABELS = 2
@@ -89,7 +87,7 @@ class Points:
 
 @dataclass(frozen=True, slots=True)
 class Layout:
-    """Packets of a topic; kind: index into KINDS.
+    """Packets of a topic; kind: index into CLOUDS.
 
     slots: most points of a column; by_ring: the slot of a point is its ring, else its order;
     has_labels: packets of version 2.

@@ -15,7 +15,7 @@ from mlbatch.errors import UsageError
 from mlbatch.outputs.damage import CheckLog, VerifyError
 from mlbatch.outputs.metadata import RunMetadata, with_variants
 from mlbatch.outputs.run_files import TABLE, RunFiles
-from mlbatch.types import VARIANTS
+from mlbatch.types import CLOUDS, VARIANTS
 from mlbatch.units import parse_rate
 from mlbatch.verification.scan_checks import Grid
 from mlbatch.verification.table import OutputTotals, Table, read_table
@@ -453,7 +453,9 @@ def _check_fill(report: Document, table: Table) -> None:
     # The last one may not count, nor for what is usual.
     ends = whole.copy()
     ends[-1:] = False
-    most, least = (_lacking(table, table.fill, rows) for rows in (whole, ends))
+    models = [report.text("sensors", i, "model") for i in range(len(table.sensors))]
+    clouds = np.array([model in CLOUDS for model in models], np.bool_)
+    most, least = (_lacking(table, table.fill, clouds, rows) for rows in (whole, ends))
     any_most, any_least = (np.logical_or.reduce(lacking, axis=1) for lacking in (most, least))
     _check_count(report, any_most, any_least, "underfilled")
     none = table.columns_of == 0
@@ -467,10 +469,13 @@ def _check_fill(report: Document, table: Table) -> None:
                 _check_count(report, more[:, i], fewer[:, i], name, sensor)
 
 
-def _lacking(table: Table, fill: F64Array, rows: BoolArray) -> BoolArray:
-    """Which of some scans (r,) lack columns of a sensor (r, s): by fill, or the usual number."""
+def _lacking(table: Table, fill: F64Array, clouds: BoolArray, rows: BoolArray) -> BoolArray:
+    """Which of some scans (r,) lack columns of a sensor (r, s): by fill, or the usual number.
+
+    clouds: sensors (s,) whose fill is unknown where they have columns.
+    """
     lacking = fill < _UNDERFILLED
-    unsure = np.isnan(fill) & (table.columns_of > 0) & rows[:, None]
+    unsure = np.isnan(fill) & (table.columns_of > 0) & rows[:, None] & clouds
     for i in np.flatnonzero(unsure.any(axis=0)).tolist():
         columns = table.columns_of[:, i]
         lacking[:, i] |= unsure[:, i] & (columns < _UNDERFILLED * np.median(columns[unsure[:, i]]))

@@ -21,7 +21,6 @@ from mlbatch.lidar.headers import EvenColumns, HeaderReader, check_of, checks
 from mlbatch.lidar.interface import Calibration, Evidence, Lidar, Records, SensorModel
 from mlbatch.ros.point_packets import (
     HEAD,
-    KINDS,
     MAGIC,
     MOST_SLOTS,
     REALS,
@@ -30,9 +29,10 @@ from mlbatch.ros.point_packets import (
     Layout,
 )
 from mlbatch.sensors.options import check_options
+from mlbatch.types import CLOUDS
 
 VENDOR = "any"
-# In the order of KINDS.
+# In the order of CLOUDS.
 MODELS: tuple[SensorModel, ...] = tuple(
     SensorModel(
         name=name,
@@ -43,7 +43,7 @@ MODELS: tuple[SensorModel, ...] = tuple(
         calibration="none: points have coordinates",
         verified="two sources",
     )
-    for name, vendor in zip(KINDS, (VENDOR, "Livox"), strict=True)
+    for name, vendor in zip(CLOUDS, (VENDOR, "Livox"), strict=True)
 )
 _FITS = 100
 # Magic, version, kind and slots: the same in all packets of a topic.
@@ -68,7 +68,7 @@ def _layout(sample: U8Array) -> Layout | None:
     if int(first["magic"]) != MAGIC or version not in (VERSION, WITH_LABELS):
         return None
     layout = Layout(kind, slots, bool(first["by_ring"]), version == WITH_LABELS)
-    known = kind < len(KINDS) and 0 < slots <= MOST_SLOTS and layout.size == sample.shape[1]
+    known = kind < len(CLOUDS) and 0 < slots <= MOST_SLOTS and layout.size == sample.shape[1]
     return layout if known else None
 
 
@@ -78,7 +78,7 @@ class CloudCalibration(Calibration):
     is_shared = True
 
     def __init__(self, kind: int) -> None:
-        self.model = KINDS[kind]
+        self.model = CLOUDS[kind]
         self._kind = kind
 
     def match_score(self, evidence: Evidence) -> int:
@@ -99,7 +99,7 @@ class CloudCalibration(Calibration):
         return CloudLidar(layout, evidence.stream.topic)
 
 
-BUILT_IN: tuple[Calibration, ...] = tuple(CloudCalibration(kind) for kind in range(len(KINDS)))
+BUILT_IN: tuple[Calibration, ...] = tuple(CloudCalibration(kind) for kind in range(len(CLOUDS)))
 
 
 def read_calibration(path: Path, content: bytes) -> Calibration | None:
@@ -110,7 +110,7 @@ def read_calibration(path: Path, content: bytes) -> Calibration | None:
 def describe(size: int, sample: U8Array) -> str | None:
     """Name packets (k, size); None if they are not cloud packets."""
     layout = _layout(np.atleast_2d(sample)[:, :size])
-    return None if layout is None else f"lidar points of a {KINDS[layout.kind]}, {layout}"
+    return None if layout is None else f"lidar points of a {CLOUDS[layout.kind]}, {layout}"
 
 
 class CloudLidar(Lidar):
@@ -122,7 +122,7 @@ class CloudLidar(Lidar):
     def __init__(self, layout: Layout, topic: str) -> None:
         slots = layout.slots
         self._layout = layout
-        self.model = KINDS[layout.kind]
+        self.model = CLOUDS[layout.kind]
         # Names the sensor if its topic does not.
         self.vendor = "Cloud"
         self.mode = str(layout)
