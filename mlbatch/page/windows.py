@@ -88,14 +88,14 @@ def read_windows(text: str, slices: int) -> Windows | None:
     """Read scans.csv; None without a row. Raises ExportError."""
     if len(text.splitlines()) < 2:
         return None
+    if slices > _LARGEST:
+        raise ExportError(
+            f"scans.csv: expected up to {_LARGEST} slices, found {slices}; convert again"
+        )
     try:
         return _windows(Cells.of(text), max(1, slices))
     except TableError as err:
         raise ExportError(f"{err.at('scans.csv')}: {err}; convert again") from err
-    except OverflowError as err:
-        raise ExportError(
-            f"scans.csv: expected up to {_LARGEST} slices, found {slices}; convert again"
-        ) from err
 
 
 def _windows(cells: Cells, slices: int) -> Windows:
