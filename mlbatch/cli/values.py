@@ -42,7 +42,7 @@ def job_of(recordings: Sequence[Path], given: Mapping[str, Any]) -> Job:
 
 
 def _named(given: Mapping[str, Any]) -> dict[str, Any]:
-    """Values by the names of the table; those of parameters are no words of Python."""
+    """Values by the names of the table; parameters have names that are no words of Python."""
     return {name.rstrip("_"): value for name, value in given.items()}
 
 

@@ -107,7 +107,7 @@ def _file_of_folder(path: Path) -> IndexedScans | None:
 
 
 def read(path: Path, *, by_window: bool = False) -> Iterator[Scan]:
-    """Yield the scans of an output in its order, with `--split` those of each sensor.
+    """Yield the scans of an output in its order, with `--split` sensor by sensor.
 
     path: as of `open_scans`, or one file of a scan; by_window: by time also where sensors have
     folders. Raises RecordingError where the output is damaged, unfinished or of another program.

@@ -1,6 +1,6 @@
 """Folders of tar files with an npz and a JSON for each scan.
 
-Headers are those of ustar (POSIX.1-1988), checked by `tarfile`; extensions of later formats, which
+Headers are ustar's (POSIX.1-1988), checked by `tarfile`; extensions of later formats, which
 may name any size or place, are damage.
 """
 

@@ -1,8 +1,8 @@
 """Rows of decoded clouds by compiled loops (`native/clouds.c`): to arrays, or at once to packets.
 
 At once are clouds of a spinning lidar: a ring for each point, times that rise in a few runs, one
-lidar a message. The packets are those of `pointcloud2.read_cloud` and `point_packets.pack`, which
-read all other clouds.
+lidar per message. The packets equal what `pointcloud2.read_cloud` and `point_packets.pack` give,
+which read all other clouds.
 """
 
 from __future__ import annotations

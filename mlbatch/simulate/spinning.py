@@ -26,7 +26,7 @@ class SpinningSpec(ABC):
 
     A column is a firing of all channels (HESAI: of a group of blocks); column k is the k-th that is
     sent. Packets take places and forms of fields from the encoder's own tables; angles and firing
-    times are those of the model's row in `mlbatch/sensors`, which the tests compare with the
+    times come from the model's row in `mlbatch/sensors`, which the tests compare with the
     document. The angles of a unit, where models have none, are made up.
     """
 
@@ -166,7 +166,7 @@ class SimulatedSpinner(SimulatedLidar):
         return Shots(first_ns, delay_s, spec.origins(self._columns), direction, is_measured)
 
     def packets(self, chunk: int, distance_m: F64Array, reflectivity: F64Array) -> list[Sent]:
-        """Packets of a chunk, and those of the device of the same time."""
+        """Packets of a chunk, and the device's own packets of the same time."""
         spec = self._spec.advanced(chunk * self._spec.chunk_packets)
         range_m = distance_m - spec.range_offset_m
         counts = whole_counts(range_m, spec.range_unit_m, spec.largest)

@@ -2,7 +2,7 @@
 
 An npz is an uncompressed zip (PKWARE APPNOTE 6.3, sections 4.3 and 4.4) of npy files, version 1.0
 (NEP 1). `numpy.savez` would stamp files with the time of day and copy arrays; `zipfile` would write
-each part on its own and go back for checksums. The bytes are those of `zipfile`; tests compare.
+each part on its own and go back for checksums. `zipfile` writes the same bytes; tests compare.
 """
 
 from __future__ import annotations

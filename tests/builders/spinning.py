@@ -168,7 +168,7 @@ def stream_of(spec: SpinningSpec, packets: int = 0) -> Encoded:
         np.broadcast_to(spec.origins(size[0]), direction.shape)[column],
         np.broadcast_to(spec.range_offset_m, size[1]),
     )
-    # Those of a Velodyne have the time only.
+    # A Velodyne's have the time only.
     neighbours = difops_of(spec.device_packet(0)) if isinstance(spec, RobosenseSpec) else ()
     seen = evidence_of(wide, host_ns, neighbours)
     found = from_file(spec.files.content, f"unit.{spec.files.name}") if spec.files.name else None

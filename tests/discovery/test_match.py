@@ -36,7 +36,7 @@ def captured(vendor: str, sent: Sent, path: Path) -> Path:
     return write_pcap(path, frames)
 
 
-def told(vendor: str, folder: Path, verb: str, *captures: Path, words: str = "") -> Outcome:
+def ran(vendor: str, folder: Path, verb: str, *captures: Path, words: str = "") -> Outcome:
     """What a command says of captures of a lidar."""
     write_metadata(folder)
     files: list[str | Path] = ["--metadata", folder / FILES[vendor]] if FILES[vendor] else []
@@ -66,7 +66,7 @@ def test_recordings_of_two_drives_are_refused(
     first = captured(vendor, one(vendor), tmp_path / "first.pcap")
     second = captured(vendor, other_drive(vendor, late_ns, later_ns), tmp_path / "second.pcap")
     for verb, words in (("convert", "--dry-run --quiet"), ("inspect", ""), ("inspect", "--whole")):
-        done = told(vendor, tmp_path, verb, first, second, words=words)
+        done = ran(vendor, tmp_path, verb, first, second, words=words)
         assert done.code == 1, done.out
         assert len(done.err.splitlines()) == 1
         assert "expected packets of " in done.err
@@ -83,12 +83,12 @@ def test_a_copy_of_a_recording_changes_nothing(vendor: str, late_ms: int, tmp_pa
     second = captured(vendor, copy, tmp_path / "second.pcap")
     words = "--dry-run --quiet"
     alone, twice = (
-        told(vendor, tmp_path, "convert", *paths, words=words)
+        ran(vendor, tmp_path, "convert", *paths, words=words)
         for paths in ([first], [first, second])
     )
     assert (alone.code, twice.code) == (0, 0), twice.err
     assert twice.err == alone.err
-    assert told(vendor, tmp_path, "inspect", first, second).code == 0
+    assert ran(vendor, tmp_path, "inspect", first, second).code == 0
 
 
 def test_two_lidars_at_one_address_are_refused_and_noted(tmp_path: Path) -> None:

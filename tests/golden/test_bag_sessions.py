@@ -42,7 +42,7 @@ SESSIONS: dict[str, Write] = {
 class Made:
     """An output in a folder of npz files."""
 
-    told: Outcome
+    outcome: Outcome
     folder: Path
 
     @property
@@ -83,7 +83,7 @@ def plain(mcap: Path, tmp_path_factory: pytest.TempPathFactory) -> Made:
 
 
 def test_two_lidars_need_no_options(plain: Made) -> None:
-    assert plain.told.err == ""
+    assert plain.outcome.err == ""
     assert len(scan_files(plain.folder)) == WHOLE_SCANS
     for sensor, lidar in zip(plain.report["sensors"], (LEFT, RIGHT), strict=True):
         assert sensor["name"] == lidar.name
@@ -118,7 +118,7 @@ def test_scans_are_those_of_the_capture_with_its_rig(plain: Made, tmp_path: Path
 @pytest.mark.parametrize("name", [name for name in SESSIONS if name != "MCAP"])
 def test_every_container_teaches_the_same(name: str, plain: Made, tmp_path: Path) -> None:
     made = convert(tmp_path / "scans", SESSIONS[name](tmp_path))
-    assert made.told.err == ""
+    assert made.outcome.err == ""
     assert made.files == plain.files
 
 
@@ -136,7 +136,7 @@ def test_packets_in_a_capture_and_the_rest_in_a_bag(plain: Made, tmp_path: Path)
     others = [one for one in session_of() if "packets" not in one.topic]
     bag = write_rosbag2(tmp_path / "knows.db3", others)
     made = convert(tmp_path / "scans", tmp_path / "drive.pcap", bag)
-    assert made.told.err == ""
+    assert made.outcome.err == ""
     sources = [sensor["extrinsics"]["source"] for sensor in made.report["sensors"]]
     assert sources == [
         "tf_static: base_link -> left/os_sensor",
@@ -180,7 +180,7 @@ def test_the_rig_of_inspect_gives_the_same_scans(name: str, plain: Made, tmp_pat
     assert command("inspect", bag, "--write-rig", rig).code == 0
     assert "metadata:" not in rig.read_text(encoding="utf-8")
     made = convert(tmp_path / "scans", bag, "--rig", rig)
-    assert made.told.err == ""
+    assert made.outcome.err == ""
     assert made.files == plain.files
 
 

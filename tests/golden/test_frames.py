@@ -60,8 +60,8 @@ def test_imus_are_below_their_sensors(name: str, tmp_path: Path) -> None:
     for sensor in ("left", "right"):
         # Of the metadata: 16 numbers row by row, mm.
         metadata: dict[str, Any] = json.loads((TWO_LIDARS / f"{sensor}.json").read_text())
-        told = metadata["imu_intrinsics"]["imu_to_sensor_transform"]
-        pose = np.reshape(told, (4, 4))
+        stated = metadata["imu_intrinsics"]["imu_to_sensor_transform"]
+        pose = np.reshape(stated, (4, 4))
         assert np.array_equal(pose[:3, :3], np.eye(3))
         expected = [*(pose[:3, 3] / 1000).tolist(), *NO_TURN]
         assert found[sensor, f"{sensor}_imu"] == pytest.approx(expected, abs=1e-12)

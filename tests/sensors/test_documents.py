@@ -1,4 +1,4 @@
-"""Rows of models are those of docs/sources: beams, firing times, lenses, optical centres, units.
+"""Rows of models say what docs/sources say: beams, firing times, lenses, optical centres, units.
 
 Decoders and encoders both take them from there: `test_round_trip.py` shows that they agree on all
 else.

@@ -132,7 +132,7 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
 
 @pytest.mark.parametrize("word", WORDS[1:])
 def test_compressed_chunks(files: dict[str, Path], word: str) -> None:
-    """The same messages; a stream reader compares checksums, indexes are those of the summary."""
+    """The same messages; a stream reader compares checksums, indexes are the summary's."""
     expected = messages(files["none"])
     assert len(expected) > 100
     assert messages(files[word]) == expected

@@ -1,7 +1,7 @@
 """Layouts of HESAI packets by model, for the encoder.
 
 Source: docs/sources/hesai.md sections 1 (versions), 2 (layout), 3 (tails), 5 (times of blocks),
-laid out here once more, apart from the decoder. Firing times are those of the rows in
+laid out here once more, apart from the decoder. Firing times come from the rows in
 `mlbatch/sensors/hesai/models.py`. Pandar20: HesaiTechnology/HesaiLidar_General_SDK.
 """
 

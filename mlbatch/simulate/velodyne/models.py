@@ -1,8 +1,8 @@
 """Velodyne models for the encoder: the layout of their packets, and the beams of a unit.
 
-Source: docs/sources/velodyne.md sections 1 to 3. Beams and times are those of the rows in
-`mlbatch/sensors/velodyne/models.py`. The HDL-64E has no beams of its own: here are those of a unit
-that does not exist, in which corrections have the usual size.
+Source: docs/sources/velodyne.md sections 1 to 3. Beams and times come from the rows in
+`mlbatch/sensors/velodyne/models.py`. The HDL-64E has no beams of its own: here is a unit that
+does not exist, in which corrections have the usual size.
 """
 
 from __future__ import annotations
