@@ -37,7 +37,7 @@ _COUNTS = 5
 # Beams of a plane are a multiple of this.
 _BEAMS_TOGETHER = 16
 _FIELD_BITS = {"u1": 8, "<u2": 16, ">u2": 16, "<u4": 32}
-# Bits of all vectors of directions; `Group.used`.
+# Bits of all vectors of directions; `used` of a Group.
 _ALL_DIRECTIONS = 0o77
 # The return type in a label.
 _TYPE_BITS = np.uint64(0xFF << 48)
@@ -484,7 +484,7 @@ def _vectors(vectors: F64Array, beams: int) -> F32Array:
 
 
 def _used_vectors(direction: F32Array, origin: F32Array, origin_turns: bool) -> int:
-    """Return bits of the vectors that are not zero, by axis; `Group.used`."""
+    """Return bits of the vectors that are not zero, by axis; `used` of a Group."""
     bits = _nonzero_axes(direction[:2])
     bits |= _nonzero_axes(direction[2:]) << 3
     if origin_turns:
@@ -494,7 +494,7 @@ def _used_vectors(direction: F32Array, origin: F32Array, origin_turns: bool) -> 
 
 
 def _used_by_table(vectors: F32Array, origin: F32Array) -> I64Array:
-    """Return bits of the vectors that the coordinates depend on, (sensors,); `Group.used`.
+    """Return bits of the vectors that the coordinates depend on, (sensors,); `used` of a Group.
 
     A term of zero changes a coordinate only from -0 to 0, which no origin other than -0 leaves.
     """

@@ -1,8 +1,9 @@
 /* Interface of the compiled library: plain C11 functions, called through ctypes.
 
-   `library.py` and `decode/groups.py` mirror the structs below, member by member: all
-   members are 8 bytes, so that there is no padding. Arrays are C-contiguous and belong to the
-   caller; no function allocates, keeps a pointer, or checks what its caller guarantees.
+   `library.py` takes structs and functions from this file, and `decode/groups.py` fills them by
+   name: a member or an argument is `type name`, `type *name` or `type name[4]`. Arrays are
+   C-contiguous and belong to the caller; no function allocates, keeps a pointer, or checks what
+   its caller guarantees.
    Floating point: float32 operations in a fixed order, no contraction, so that every compiler and
    processor gives the same bytes. */
 #ifndef MLBATCH_NATIVE_H

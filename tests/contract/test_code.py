@@ -45,8 +45,6 @@ def _attributes(node: ast.ClassDef) -> Iterator[str]:
         elif isinstance(inner, ast.AnnAssign | ast.Assign):
             targets = [inner.target] if isinstance(inner, ast.AnnAssign) else inner.targets
             yield from (ast.unparse(target).removeprefix("self.") for target in targets)
-        elif isinstance(inner, ast.Constant) and isinstance(inner.value, str):
-            yield inner.value  # A field of a ctypes structure.
 
 
 @pytest.mark.parametrize("plugin", plugins(), ids=_by_name)

@@ -53,7 +53,7 @@ def built(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_a_wheel_has_every_module_and_asset_and_the_library(built: Path) -> None:
     with zipfile.ZipFile(built) as archive:
         names = {name for name in archive.namelist() if name.startswith("mlbatch/")}
-    suffixes = (".py", ".css", ".js", ".yaml", ".typed", ".html")
+    suffixes = (".py", ".h", ".css", ".js", ".yaml", ".typed", ".html")
     files = {
         path for path in PACKAGE.rglob("*") if path.suffix in suffixes or path.name == "py.typed"
     }

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import ctypes
-import re
 import shutil
 import subprocess
 from collections.abc import Iterator
@@ -20,10 +18,6 @@ from tests.contract.tree import PACKAGE
 
 SOURCES = PACKAGE / "native"
 HEADER = (SOURCES / "native.h").read_text(encoding="utf-8")
-COMMENT = re.compile(r"/\*.*?\*/", re.DOTALL)
-STRUCT = re.compile(r"typedef struct \{(.*?)\} (\w+);", re.DOTALL)
-MEMBER = re.compile(r"(const )?(\w+) (\*?)(\w+);")
-PROTOTYPE = re.compile(r"EXPORT \w+ (mlbatch_\w+)\((.*?)\);", re.DOTALL)
 
 
 @pytest.fixture
@@ -34,43 +28,6 @@ def _fresh() -> Iterator[None]:
     yield
     library.library.cache_clear()
     library.trouble.cache_clear()
-
-
-def declared() -> dict[str, list[tuple[str, bool]]]:
-    """The structs of the header: names of the members, and whether they are pointers."""
-    found = STRUCT.findall(COMMENT.sub("", HEADER))
-    return {
-        name: [(member[3], member[2] == "*") for member in MEMBER.findall(body)]
-        for body, name in found
-    }
-
-
-@pytest.mark.parametrize(
-    "name",
-    [
-        *("Ring", "Field", "Group", "Scan", "Part", "Dissection"),
-        *("Reader", "Numbers", "Intake", "Arrival", "Accepted"),
-    ],
-)
-def test_structs_are_those_of_the_header(name: str) -> None:
-    kind = getattr(library, name)
-    mirrored = [(member, of is ctypes.c_void_p) for member, of in kind._fields_]
-    assert mirrored == declared()[name]
-    # No padding.
-    assert ctypes.sizeof(kind) == 8 * len(mirrored)
-
-
-def test_functions_have_the_arguments_of_the_header() -> None:
-    found = {}
-    for name, arguments in PROTOTYPE.findall(COMMENT.sub("", HEADER)):
-        parts = [part for part in arguments.split(",") if part.strip() != "void"]
-        found[name] = tuple(ctypes.c_void_p if "*" in one else ctypes.c_int64 for one in parts)
-    assert found == library._FUNCTIONS
-
-
-def test_the_version_of_the_declarations_is_that_of_the_header() -> None:
-    (number,) = re.findall(r"#define MLBATCH_ABI (\d+)", HEADER)
-    assert int(number) == library._ABI
 
 
 @pytest.mark.usefixtures("_fresh")
