@@ -68,8 +68,8 @@ class LibraryHook(BuildHookInterface):  # type: ignore[type-arg]
                 "by CC, or unset CC and install without any"
             ) from err
         try:
-            # Whole or absent, also for a process that loads it now.
-            partial = root / f"{LIBRARY}.partial"
+            # Whole or absent, also for a process that loads it now or another installation.
+            partial = root / f"{LIBRARY}.{os.getpid()}.partial"
             shutil.copy(library, partial)
             os.replace(partial, root / LIBRARY)
         except OSError:
