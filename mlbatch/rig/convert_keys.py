@@ -20,9 +20,8 @@ from mlbatch.rig.keys import (
     TEXT,
     Form,
     Key,
+    Section,
     choice_form,
-    mapping_form,
-    names,
     whole_form,
 )
 from mlbatch.rig.yaml_tree import Node
@@ -111,23 +110,20 @@ def _form(option: Option) -> Form:
     return choice_form(*option.words) if option.words and not option.is_open else TEXT
 
 
-def key_of(option: Option) -> Key[Values]:
+def key_of(option: Option) -> Key:
     """The key of a rig that keeps an option."""
     read, form = _OTHERS.get(option.name) or (partial(_value, option), _form(option))
-    return Key(option.name, read, (), form, option.about)
+    return Key(option.name, read, form, option.about)
 
 
-CONVERT: tuple[Key[Values], ...] = tuple(
-    key_of(option) for option in options.CONVERT if option.in_rig
-)
-FORM: Form = mapping_form(CONVERT)
+CONVERT = Section(tuple(key_of(option) for option in options.CONVERT if option.in_rig))
 
 
 def read_options(node: Node) -> tuple[RigOption, ...]:
     """Return the options of a `convert:` section."""
-    fields: Mapping[str, Node] = node.fields(names(CONVERT))
+    fields = CONVERT.fields(node)
     return tuple(
         RigOption(key.name, key.read(fields[key.name]), fields[key.name].place)
-        for key in CONVERT
+        for key in CONVERT.keys
         if key.name in fields
     )

@@ -1,94 +1,88 @@
-"""Keys of mappings in a rig file: how each value is read, and its form as JSON schema."""
+"""Sections of a rig file: how the value of each key is read, and its form as JSON schema."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
-from typing import Generic, Protocol, TypeAlias, TypeVar
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple, TypeAlias
 
 from mlbatch.rig.yaml_tree import Node
 
-T = TypeVar("T")
 # A JSON schema (draft 2020-12) of one value.
 Form: TypeAlias = Mapping[str, object]
 
 
-@dataclass(frozen=True, slots=True)
-class Key(Generic[T]):
-    """A key of a mapping: its name, the reader of its value, and the value without the key.
+class Key(NamedTuple):
+    """A key of a section: its name, the reader of its value, and the value without the key.
 
     form: of the value; about: one line for people who write a rig.
     """
 
     name: str
-    read: Callable[[Node], T]
-    default: T
+    read: Callable[[Node], Any]
     form: Form
     about: str
-
-    def of(self, fields: Mapping[str, Node]) -> T:
-        """Return the value in a mapping."""
-        return self.read(fields[self.name]) if self.name in fields else self.default
+    default: Any = None
 
 
-class Described(Protocol):
-    """A `Key` of any value."""
-
-    @property
-    def name(self) -> str:
-        """The key in the file."""
-        ...
-
-    @property
-    def form(self) -> Form:
-        """Form of the value."""
-        ...
-
-    @property
-    def about(self) -> str:
-        """One line of help."""
-        ...
-
-
-def names(keys: Sequence[Described]) -> list[str]:
-    """Names of keys."""
-    return [key.name for key in keys]
-
-
-def mapping_form(
-    keys: Sequence[Described],
-    required: Sequence[str] = (),
-    *,
-    excludes: Mapping[str, Sequence[str]] | None = None,
-    needs: Mapping[str, str] | None = None,
-    may_be_empty: bool = True,
-) -> Form:
-    """Form of a mapping with these keys and no others.
+@dataclass(frozen=True, slots=True)
+class Section:
+    """A mapping with these keys and no others.
 
     excludes: keys that others exclude; needs: keys that need another one.
     """
-    known = names(keys)
-    form: dict[str, object] = {
-        "type": "object",
-        "properties": {key.name: {"description": key.about, **key.form} for key in keys},
-        "additionalProperties": False,
-    }
-    if required:
-        form["required"] = list(required)
-    if not may_be_empty:
-        form["minProperties"] = 1
-    pairs = [
-        {"not": {"required": [key, other]}}
-        for key, others in (excludes or {}).items()
-        for other in others
-        if key in known and other in known
-    ]
-    if pairs:
-        form["allOf"] = pairs
-    dependent = {key: [other] for key, other in (needs or {}).items() if key in known}
-    if dependent:
-        form["dependentRequired"] = dependent
-    return form
+
+    keys: tuple[Key, ...]
+    required: tuple[str, ...] = ()
+    excludes: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    needs: Mapping[str, str] = field(default_factory=dict)
+    may_be_empty: bool = True
+
+    def fields(self, node: Node) -> Mapping[str, Node]:
+        """Return the entries of a mapping; RigError for keys that do not fit."""
+        names = [key.name for key in self.keys]
+        fields = node.fields(names, self.required)
+        if not fields and not self.may_be_empty:
+            raise node.error(f"at least one of {', '.join(names)}", "none", "add one of them")
+        for key, others in self.excludes.items():
+            for other in others:
+                if key in fields and other in fields:
+                    found = f"{other} as well (line {fields[other].line})"
+                    raise fields[key].error(f"{key} without {other}", found, "keep one of the two")
+        for key, other in self.needs.items():
+            if key in fields and other not in fields:
+                raise fields[key].error(f"{key} with {other}", f"no {other}", f"add the {other}")
+        return fields
+
+    def read(self, node: Node) -> dict[str, Any]:
+        """Return the values by key; RigError for the first mistake."""
+        fields = self.fields(node)
+        return {
+            key.name: key.read(fields[key.name]) if key.name in fields else key.default
+            for key in self.keys
+        }
+
+    @property
+    def form(self) -> Form:
+        """Form of the mapping."""
+        form: dict[str, object] = {
+            "type": "object",
+            "properties": {key.name: {"description": key.about, **key.form} for key in self.keys},
+            "additionalProperties": False,
+        }
+        if self.required:
+            form["required"] = list(self.required)
+        if not self.may_be_empty:
+            form["minProperties"] = 1
+        if self.excludes:
+            form["allOf"] = [
+                {"not": {"required": [key, other]}}
+                for key, others in self.excludes.items()
+                for other in others
+            ]
+        if self.needs:
+            form["dependentRequired"] = {key: [other] for key, other in self.needs.items()}
+        return form
 
 
 def choice_form(*words: str) -> Form:

@@ -94,10 +94,9 @@ def _urls(node: Node) -> tuple[str, ...]:
     return tuple(item.word(f"the URL of a page, or {UNKNOWN}", _PAGE) for item in items)
 
 
-DATASET_KEY: Key[Dataset | None] = Key(
+DATASET_KEY = Key(
     DATASET,
     dataset_of,
-    None,
     {"type": "object", "required": list(_REQUIRED)},
     "facts about a public dataset; files are searched around the recordings",
 )

@@ -8,10 +8,10 @@ from __future__ import annotations
 import ipaddress
 import os
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from fractions import Fraction
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -19,8 +19,7 @@ from mlbatch.arrays import F64Array
 from mlbatch.errors import RigError, UsageError
 from mlbatch.frames.transforms import from_quaternion, from_rpy_deg, rigid
 from mlbatch.lidar.limits import MAX_TRANSLATION_M
-from mlbatch.rig import convert_keys
-from mlbatch.rig.convert_keys import RigOption
+from mlbatch.rig.convert_keys import CONVERT, read_options
 from mlbatch.rig.keys import (
     FLAG,
     NUMBER,
@@ -30,15 +29,15 @@ from mlbatch.rig.keys import (
     WORD,
     Form,
     Key,
+    Section,
     choice_form,
-    mapping_form,
-    names,
     numbers_form,
     text_form,
     whole_form,
 )
 from mlbatch.rig.recipes import DATASET_KEY
 from mlbatch.rig.rig import (
+    DATASET,
     DEFAULT_BODY_FRAME,
     MAX_NAME,
     Rig,
@@ -68,16 +67,33 @@ _TEXT = re.compile(r"\S(.*\S)?")
 _WORD = re.compile(r"[^\s\x00-\x1f\x7f-\x9f\ud800-\udfff]+")
 
 
+# Of a sensor_msgs/PointField, and whole numbers of 64 bits.
+FIELD_TYPES = ("i1", "u1", "i2", "u2", "i4", "u4", "i8", "u8", "f4", "f8")
+_PADDING = re.compile(r"V([1-9]\d{0,3})", re.ASCII)
+_NAMED_PARTS = re.compile(r"\{[^}]*\}?")
+_NAMED_PART = re.compile(r"\{(sensor|stamp(:(s|ms|us|ns|iso))?)\}")
+
+
 def _word_key(
     name: str, what: str, about: str, pattern: re.Pattern[str] = _WORD, form: Form = WORD
-) -> Key[str]:
+) -> Key:
     """A key whose value is text, "" without it; what: of an error."""
-    return Key(name, lambda node: node.word(what, pattern), "", form, about)
+    return Key(name, lambda node: node.word(what, pattern), form, about, "")
 
 
-def _choice_key(name: str, words: tuple[str, ...], about: str) -> Key[str]:
+def _choice_key(name: str, words: tuple[str, ...], about: str) -> Key:
     """A key whose value is one of some words, "" without it."""
-    return Key(name, lambda node: node.choice(words), "", choice_form(*words), about)
+    return Key(name, lambda node: node.choice(words), choice_form(*words), about, "")
+
+
+def _whole_key(name: str, low: int, high: int, about: str, default: int | None) -> Key:
+    """A key whose value is a whole number."""
+    return Key(name, lambda node: node.whole(low, high), whole_form(low, high), about, default)
+
+
+def _numbers_key(name: str, count: int, about: str) -> Key:
+    """A key whose value is a list of numbers."""
+    return Key(name, lambda node: node.numbers(count), numbers_form(count), about)
 
 
 def _model(node: Node) -> str | None:
@@ -132,40 +148,30 @@ def _options(node: Node) -> dict[str, str]:
 
 
 def _stream(node: Node) -> StreamSelector:
-    fields = _some_fields(node, names(_STREAM_KEYS))
-    return StreamSelector(
-        source_ip=_SOURCE_IP.of(fields),
-        port=_PORT.of(fields),
-        topic=_TOPIC.of(fields),
-        serial=_SERIAL.of(fields),
-        frame_id=_FRAME_ID.of(fields).lstrip("/"),
-        lidar_id=_LIDAR_ID.of(fields),
-    )
+    values = STREAM.read(node)
+    return StreamSelector(**values | {"frame_id": values["frame_id"].lstrip("/")})
 
 
-def _points(node: Node) -> PointRule:
-    """Return how decoded clouds are read; the fields are checked with the first of them."""
+def _points(node: Node) -> tuple[PointRule, Sweeps | None]:
+    """Return how decoded clouds are read, and files of sweeps if `points` names some.
+
+    The fields are checked with the first cloud.
+    """
     # Few rigs have it.
     from mlbatch.ros.point_times import UNITS_NS, PointRule
 
-    fields = _some_fields(node, names(_POINTS_KEYS))
-    return PointRule(
-        time=_POINT_TIME.of(fields),
-        unit_ns=UNITS_NS.get(_POINT_UNIT.of(fields), 0),
-        origin=_POINT_ORIGIN.of(fields),
-        ring=_POINT_RING.of(fields),
-        places={key: value.place for key, value in fields.items()},
+    values = POINTS.read(node)
+    rule = PointRule(
+        time=values["time"],
+        unit_ns=UNITS_NS.get(values["unit"], 0),
+        origin=values["from"],
+        ring=values["ring"],
+        places={key: value.place for key, value in node.entries.items()},
     )
-
-
-def _sweeps(node: Node) -> Sweeps | None:
-    """Return the files of a folder of sweeps, None where `points` names none."""
-    fields = node.entries
-    if "glob" not in fields:
-        return None
-    return Sweeps(
-        _GLOB.of(fields), _DTYPE.of(fields), fields["glob"].place, tuple(_ARRAYS.of(fields).items())
-    )
+    if not values["glob"]:
+        return rule, None
+    arrays = tuple(values["arrays"].items())
+    return rule, Sweeps(values["glob"], values["dtype"], node.entries["glob"].place, arrays)
 
 
 def _glob(node: Node) -> str:
@@ -209,45 +215,31 @@ def _field_type(node: Node) -> str:
     return f"V{int(found[1])}"
 
 
-def _clock(node: Node) -> Mapping[str, Node]:
-    return node.fields(names(_CLOCK_KEYS))
+def _clock(node: Node) -> dict[str, object]:
+    """Return fields of a `RigSensor`."""
+    values = CLOCK.read(node)
+    source, epoch = values["source"] or None, values["epoch"] or None
+    return {"clock": source, "epoch": epoch, "offset_ns": values["offset_s"]}
 
 
 def _extrinsics(node: Node) -> F64Array | str | UnknownExtrinsics | ExtrinsicsFiles:
     """Return (4, 4) body_from_sensor, m, a frame of the recording, unknown, or files with it."""
     if node.kind == "scalar" and node.text == UNKNOWN:
         return UnknownExtrinsics(node.place)
-    fields = _some_fields(node, names(_EXTRINSICS_KEYS))
-    if "file" in fields:
-        return _extrinsics_files(node, fields)
-    frame = _FRAME_OF_EXTRINSICS.of(fields)
-    if frame:
-        return frame
-    return _pose(fields)
-
-
-def _extrinsics_files(node: Node, fields: Mapping[str, Node]) -> ExtrinsicsFiles:
+    values = EXTRINSICS.read(node)
+    if not values["file"]:
+        return values["frame"] or _pose(node, values)
     # Few rigs have it.
     from mlbatch.rig.extrinsics_files import ExtrinsicsFiles
 
-    keys = _MATRIX_KEYS.of(fields)
-    direction = _DIRECTION.of(fields)
-    if direction and not keys:
-        raise fields["direction"].error(
+    if values["direction"] and not values["key"]:
+        raise node.entries["direction"].error(
             "direction with key",
             "no key",
             "name the matrix as key; files with named frames state their direction",
         )
-    return ExtrinsicsFiles(
-        node,
-        _FILES.of(fields),
-        _FRAME_OF_EXTRINSICS.of(fields),
-        _PARENT.of(fields),
-        keys,
-        direction,
-        _MATRIX_UNIT.of(fields),
-        _SENSOR_IN_FRAME.of(fields),
-    )
+    words = ("file", "frame", "parent", "key", "direction", "matrix_unit", "sensor_in_frame")
+    return ExtrinsicsFiles(node, *(values[name] for name in words))
 
 
 def _files(node: Node) -> tuple[Path, ...]:
@@ -266,18 +258,16 @@ def _matrix_keys(node: Node) -> tuple[str, ...]:
 
 
 def _sensor_in_frame(node: Node) -> F64Array:
-    return _pose(_some_fields(node, names(_POSE_KEYS)))
+    return _pose(node, SENSOR_IN_FRAME.read(node))
 
 
-def _pose(fields: Mapping[str, Node]) -> F64Array:
+def _pose(node: Node, values: Mapping[str, Any]) -> F64Array:
     """Return the (4, 4) transform, m, that translation and rotation or a matrix give."""
-    origin = _TRANSLATION.of(fields)
-    if "rotation_xyzw" in fields:
-        xyzw = fields["rotation_xyzw"].numbers(4)
-        return _located(fields["rotation_xyzw"], lambda: from_quaternion(origin, xyzw))
-    if "matrix" in fields:
-        return _matrix(fields["matrix"])
-    return from_rpy_deg(origin, _ROTATION_RPY.of(fields))
+    origin, xyzw = values["translation_m"], values["rotation_xyzw"]
+    if xyzw is not None:
+        return _located(node.entries["rotation_xyzw"], lambda: from_quaternion(origin, xyzw))
+    matrix: F64Array | None = values.get("matrix")
+    return from_rpy_deg(origin, values["rotation_rpy_deg"]) if matrix is None else matrix
 
 
 def _translation(node: Node) -> list[float]:
@@ -321,259 +311,215 @@ def _sensors(node: Node) -> tuple[Node, ...]:
     return items
 
 
-# The keys of each mapping.
+# -- sections -------------------------------------------------------------------------------------
 
-_SOURCE_IP = Key("source_ip", _ip_address, "", WORD, "source IP of the packets")
-_PORT = Key("port", lambda node: node.whole(1, 65535), 0, whole_form(1, 65535), "destination port")
-_TOPIC = _word_key("topic", "a topic without spaces", "topic of a bag")
-# Text, since leading zeros count.
-_SERIAL = _word_key("serial", "a serial number without spaces", "serial number in the packets")
-# Of one of several lidars whose clouds share a topic.
-_FRAME_ID = _word_key(
-    "frame_id",
-    "a frame_id without spaces",
-    "frame of one of several lidars whose clouds share a topic",
+_OF_ONE = "of one of several lidars whose clouds share a topic"
+STREAM = Section(
+    (
+        Key("source_ip", _ip_address, WORD, "source IP of the packets", ""),
+        _whole_key("port", 1, 65535, "destination port", 0),
+        _word_key("topic", "a topic without spaces", "topic of a bag"),
+        # Text, since leading zeros count.
+        _word_key("serial", "a serial number without spaces", "serial number in the packets"),
+        _word_key("frame_id", "a frame_id without spaces", f"frame {_OF_ONE}"),
+        _whole_key("lidar_id", 0, 65535, f"number {_OF_ONE}", None),
+    ),
+    excludes={"topic": ("source_ip", "port")},
+    needs={"frame_id": "topic", "lidar_id": "topic"},
+    may_be_empty=False,
 )
-_LIDAR_ID: Key[int | None] = Key(
-    "lidar_id",
-    lambda node: node.whole(0, 65535),
-    None,
-    whole_form(0, 65535),
-    "number of one of several lidars whose clouds share a topic",
+POINTS = Section(
+    (
+        _word_key("time", "the name of a field", "field with the time of a point"),
+        _choice_key("unit", ("s", "ms", "us", "ns"), "unit of that field"),
+        _choice_key(
+            "from",
+            ("start", "end", "back", "absolute"),
+            "the header's stamp is that of the first point, of the last one; times are ages; or "
+            "from 1970",
+        ),
+        _word_key("ring", "the name of a field", "field with the ring of a point"),
+        Key("glob", _glob, WORD, "files of sweeps in the folder of the recording", ""),
+        Key(
+            "dtype",
+            _dtype,
+            {
+                "type": "object",
+                "additionalProperties": text_form(r"[<|=]?\w+"),
+                "minProperties": 1,
+            },
+            "fields of a point in the files, and their numpy types, in order; PCD states its own",
+            (),
+        ),
+        Key(
+            "arrays",
+            _options,
+            {"type": "object", "additionalProperties": WORD, "minProperties": 1},
+            "array of a .npz file for each field of a point; points.0: its first column",
+            {},
+        ),
+    ),
+    excludes={"arrays": ("dtype",)},
+    needs={"dtype": "glob", "arrays": "glob"},
+    may_be_empty=False,
 )
-_STREAM_KEYS = (_SOURCE_IP, _PORT, _TOPIC, _SERIAL, _FRAME_ID, _LIDAR_ID)
-
-_POINT_TIME = _word_key("time", "the name of a field", "field with the time of a point")
-_POINT_UNIT = _choice_key("unit", ("s", "ms", "us", "ns"), "unit of that field")
-_POINT_ORIGIN = _choice_key(
-    "from",
-    ("start", "end", "back", "absolute"),
-    "the header's stamp is that of the first point, of the last one; times are ages; or from 1970",
+CLOCK = Section(
+    (
+        _choice_key("source", ("sensor", "host"), "timestamps of packets, or their receive times"),
+        _choice_key("epoch", ("utc", "tai", "gps"), "what the timestamps count; converted to UTC"),
+        Key(
+            "offset_s",
+            _offset_ns,
+            {"type": "number", "minimum": -MAX_OFFSET_S, "maximum": MAX_OFFSET_S},
+            "added to the timestamps, s",
+            0,
+        ),
+    )
 )
-_POINT_RING = _word_key("ring", "the name of a field", "field with the ring of a point")
-# Of a sensor_msgs/PointField, and whole numbers of 64 bits.
-FIELD_TYPES = ("i1", "u1", "i2", "u2", "i4", "u4", "i8", "u8", "f4", "f8")
-_PADDING = re.compile(r"V([1-9]\d{0,3})", re.ASCII)
-_NAMED_PARTS = re.compile(r"\{[^}]*\}?")
-_NAMED_PART = re.compile(r"\{(sensor|stamp(:(s|ms|us|ns|iso))?)\}")
-_GLOB = Key("glob", _glob, "", WORD, "files of sweeps in the folder of the recording")
-_DTYPE: Key[tuple[tuple[str, str], ...]] = Key(
-    "dtype",
-    _dtype,
-    (),
-    {
-        "type": "object",
-        "additionalProperties": text_form(r"[<|=]?\w+"),
-        "minProperties": 1,
+_NOWHERE = (0.0, 0.0, 0.0)
+_POSE_KEYS = (
+    Key("translation_m", _translation, numbers_form(3), "x, y, z, m, body frame", _NOWHERE),
+    _numbers_key(
+        "rotation_rpy_deg", 3, "roll, pitch, yaw about the fixed axes x, y, z, degrees"
+    )._replace(default=_NOWHERE),
+    _numbers_key("rotation_xyzw", 4, "unit quaternion"),
+)
+_ONE_ROTATION = {"rotation_xyzw": ("rotation_rpy_deg",)}
+_BY_NUMBERS = ("translation_m", "rotation_rpy_deg", "rotation_xyzw")
+SENSOR_IN_FRAME = Section(_POSE_KEYS, excludes=_ONE_ROTATION, may_be_empty=False)
+EXTRINSICS = Section(
+    (
+        *_POSE_KEYS,
+        Key(
+            "matrix",
+            _matrix,
+            {"type": "array", "items": numbers_form(4), "minItems": 3, "maxItems": 4},
+            "body_from_sensor, 4 x 4 or 3 x 4, m",
+        ),
+        _word_key(
+            "frame",
+            "the name of a frame",
+            "frame of the sensor in the file, or in the recording's transforms",
+        ),
+        Key(
+            "file",
+            _files,
+            {"anyOf": [TEXT, {"type": "array", "items": TEXT, "minItems": 1}]},
+            "file or files with the extrinsics, relative to this file",
+            (),
+        ),
+        _word_key("parent", "the name of a frame", "frame of the file that is the body frame"),
+        Key(
+            "key",
+            _matrix_keys,
+            {"anyOf": [WORD, {"type": "array", "items": WORD, "minItems": 1}]},
+            "key of a matrix in the file; several are multiplied",
+            (),
+        ),
+        _choice_key("direction", ("body_from_sensor", "sensor_from_body"), "what the matrix maps"),
+        _choice_key("matrix_unit", ("m", "mm"), "unit of their translations"),
+        Key(
+            "sensor_in_frame",
+            _sensor_in_frame,
+            SENSOR_IN_FRAME.form,
+            "pose of the sensor in the frame of the file",
+        ),
+    ),
+    excludes={
+        **_ONE_ROTATION,
+        "matrix": _BY_NUMBERS,
+        "frame": (*_BY_NUMBERS, "matrix"),
+        "file": (*_BY_NUMBERS, "matrix"),
+        "key": ("frame", "parent"),
     },
-    "fields of a point in the files, and their numpy types, in order; PCD states its own",
-)
-_ARRAYS: Key[dict[str, str]] = Key(
-    "arrays",
-    _options,
-    {},
-    {"type": "object", "additionalProperties": WORD, "minProperties": 1},
-    "array of a .npz file for each field of a point; points.0: its first column",
-)
-_POINTS_KEYS = (_POINT_TIME, _POINT_UNIT, _POINT_ORIGIN, _POINT_RING, _GLOB, _DTYPE, _ARRAYS)
-
-_CLOCK_SOURCE = _choice_key(
-    "source", ("sensor", "host"), "timestamps of packets, or their receive times"
-)
-_CLOCK_EPOCH = _choice_key(
-    "epoch", ("utc", "tai", "gps"), "what the timestamps count; converted to UTC"
-)
-_CLOCK_OFFSET = Key(
-    "offset_s",
-    _offset_ns,
-    0,
-    {"type": "number", "minimum": -MAX_OFFSET_S, "maximum": MAX_OFFSET_S},
-    "added to the timestamps, s",
-)
-_CLOCK_KEYS = (_CLOCK_SOURCE, _CLOCK_EPOCH, _CLOCK_OFFSET)
-
-_TRANSLATION = Key(
-    "translation_m", _translation, [0.0, 0.0, 0.0], numbers_form(3), "x, y, z, m, body frame"
-)
-_ROTATION_RPY = Key(
-    "rotation_rpy_deg",
-    lambda node: node.numbers(3),
-    [0.0, 0.0, 0.0],
-    numbers_form(3),
-    "roll, pitch, yaw about the fixed axes x, y, z, degrees",
-)
-_ROTATION_XYZW: Key[list[float] | None] = Key(
-    "rotation_xyzw", lambda node: node.numbers(4), None, numbers_form(4), "unit quaternion"
-)
-_MATRIX: Key[F64Array | None] = Key(
-    "matrix",
-    _matrix,
-    None,
-    {"type": "array", "items": numbers_form(4), "minItems": 3, "maxItems": 4},
-    "body_from_sensor, 4 x 4 or 3 x 4, m",
-)
-_FRAME_OF_EXTRINSICS = _word_key(
-    "frame",
-    "the name of a frame",
-    "frame of the sensor in the file, or in the recording's transforms",
-)
-_POSE_KEYS = (_TRANSLATION, _ROTATION_RPY, _ROTATION_XYZW)
-_SOME_WORDS: Form = {"anyOf": [WORD, {"type": "array", "items": WORD, "minItems": 1}]}
-_FILES: Key[tuple[Path, ...]] = Key(
-    "file",
-    _files,
-    (),
-    {"anyOf": [TEXT, {"type": "array", "items": TEXT, "minItems": 1}]},
-    "file or files with the extrinsics, relative to this file",
-)
-_PARENT = _word_key("parent", "the name of a frame", "frame of the file that is the body frame")
-_MATRIX_KEYS: Key[tuple[str, ...]] = Key(
-    "key", _matrix_keys, (), _SOME_WORDS, "key of a matrix in the file; several are multiplied"
-)
-_DIRECTION = _choice_key(
-    "direction", ("body_from_sensor", "sensor_from_body"), "what the matrix maps"
-)
-_MATRIX_UNIT = _choice_key("matrix_unit", ("m", "mm"), "unit of their translations")
-# Keys of streams and extrinsics that need another one.
-_NEEDS = {
-    "frame_id": "topic",
-    "lidar_id": "topic",
-    "parent": "file",
-    "key": "direction",
-    "direction": "file",
-    "matrix_unit": "key",
-    "sensor_in_frame": "file",
-    "dtype": "glob",
-    "arrays": "glob",
-}
-# Keys of streams and extrinsics that exclude others.
-_EXCLUDES = {
-    "rotation_xyzw": ("rotation_rpy_deg",),
-    "matrix": ("translation_m", "rotation_rpy_deg", "rotation_xyzw"),
-    "frame": ("translation_m", "rotation_rpy_deg", "rotation_xyzw", "matrix"),
-    "topic": ("source_ip", "port"),
-    "file": ("translation_m", "rotation_rpy_deg", "rotation_xyzw", "matrix"),
-    "key": ("frame", "parent"),
-    "arrays": ("dtype",),
-}
-_SENSOR_IN_FRAME: Key[F64Array | None] = Key(
-    "sensor_in_frame",
-    _sensor_in_frame,
-    None,
-    mapping_form(_POSE_KEYS, excludes=_EXCLUDES, may_be_empty=False),
-    "pose of the sensor in the frame of the file",
-)
-_EXTRINSICS_KEYS = (
-    *_POSE_KEYS,
-    _MATRIX,
-    _FRAME_OF_EXTRINSICS,
-    _FILES,
-    _PARENT,
-    _MATRIX_KEYS,
-    _DIRECTION,
-    _MATRIX_UNIT,
-    _SENSOR_IN_FRAME,
-)
-_EXTRINSICS_FORM: Form = {
-    "anyOf": [
-        {"const": UNKNOWN},
-        mapping_form(_EXTRINSICS_KEYS, excludes=_EXCLUDES, needs=_NEEDS, may_be_empty=False),
-    ]
-}
-
-# A name fits ROS topics, frames and file names.
-_SENSOR_NAME = _word_key(
-    "name",
-    f"a name of at most {MAX_NAME} letters, digits and _, not a digit first",
-    "name in topics, folders and frames",
-    _NAME,
-    text_form(rf"[A-Za-z_][A-Za-z0-9_]{{0,{MAX_NAME - 1}}}"),
-)
-_MODEL: Key[str | None] = Key("model", _model, None, TEXT, "auto, or a name of `mlbatch sensors`")
-_STREAM: Key[StreamSelector | None] = Key(
-    "stream",
-    _stream,
-    None,
-    mapping_form(_STREAM_KEYS, excludes=_EXCLUDES, needs=_NEEDS, may_be_empty=False),
-    "its packets; default: any that match its calibration",
-)
-_METADATA: Key[Path | None] = Key(
-    "metadata", _existing_file, None, TEXT, "metadata or calibration, relative to this file"
-)
-_EXTRINSICS: Key[F64Array | str | UnknownExtrinsics | ExtrinsicsFiles | None] = Key(
-    "extrinsics", _extrinsics, None, _EXTRINSICS_FORM, "body_from_sensor; default: the recording's"
-)
-_CLOCK: Key[Mapping[str, Node]] = Key("clock", _clock, {}, mapping_form(_CLOCK_KEYS), "its clock")
-_MIN_RANGE: Key[float | None] = Key("min_range_m", _range_m, None, RANGE_M, "drop nearer points, m")
-_MAX_RANGE: Key[float | None] = Key(
-    "max_range_m", _range_m, None, RANGE_M, "drop farther points, m"
-)
-_OPTIONAL = Key("optional", Node.flag, False, FLAG, "may be absent from a recording")
-_DECODE: Key[dict[str, str]] = Key("decode", _options, {}, OPTIONS, "options of its decoder")
-_POINTS: Key[PointRule | None] = Key(
-    "points",
-    _points,
-    None,
-    mapping_form(_POINTS_KEYS, needs=_NEEDS, may_be_empty=False),
-    "how decoded clouds are read; only with a topic, or files of sweeps",
-)
-_SENSOR_KEYS = (
-    _SENSOR_NAME,
-    _MODEL,
-    _STREAM,
-    _METADATA,
-    _EXTRINSICS,
-    _CLOCK,
-    _MIN_RANGE,
-    _MAX_RANGE,
-    _OPTIONAL,
-    _DECODE,
-    _POINTS,
-)
-
-# Fleets put the name of the robot before a slash.
-_BODY_FRAME = _word_key(
-    "body_frame",
-    "a frame name of letters, digits, _ and / that does not start with a digit",
-    "frame of all points",
-    _FRAME,
-    text_form(r"/?[A-Za-z_][A-Za-z0-9_]*(/[A-Za-z_][A-Za-z0-9_]*)*"),
-)
-_RATE: Key[Fraction | None] = Key(
-    "rate_hz",
-    _rate,
-    None,
-    {"anyOf": [{**NUMBER, "exclusiveMinimum": 0}, text_form(r"[0-9./]+")]},
-    "scans per second: 10, 29.97, 10/3",
-)
-_SENSORS: Key[tuple[Node, ...]] = Key(
-    "sensors",
-    _sensors,
-    (),
-    {
-        "type": "array",
-        "items": mapping_form(_SENSOR_KEYS, required=("name",)),
-        "minItems": 1,
-        "maxItems": MAX_SENSORS,
+    needs={
+        "parent": "file",
+        "key": "direction",
+        "direction": "file",
+        "matrix_unit": "key",
+        "sensor_in_frame": "file",
     },
-    "sensors in the order of lidar_id",
+    may_be_empty=False,
 )
-_BOXES = Key(
-    "exclude_boxes_m",
-    _boxes,
-    no_boxes(),
-    {"type": "array", "items": numbers_form(6)},
-    "boxes x0, y0, z0, x1, y1, z1, m, body frame, without points",
+SENSOR = Section(
+    (
+        # A name fits ROS topics, frames and file names.
+        _word_key(
+            "name",
+            f"a name of at most {MAX_NAME} letters, digits and _, not a digit first",
+            "name in topics, folders and frames",
+            _NAME,
+            text_form(rf"[A-Za-z_][A-Za-z0-9_]{{0,{MAX_NAME - 1}}}"),
+        ),
+        Key("model", _model, TEXT, "auto, or a name of `mlbatch sensors`"),
+        Key(
+            "stream",
+            _stream,
+            STREAM.form,
+            "its packets; default: any that match its calibration",
+        ),
+        Key("metadata", _existing_file, TEXT, "metadata or calibration, relative to this file"),
+        Key(
+            "extrinsics",
+            _extrinsics,
+            {"anyOf": [{"const": UNKNOWN}, EXTRINSICS.form]},
+            "body_from_sensor; default: the recording's",
+        ),
+        Key("clock", _clock, CLOCK.form, "its clock", {}),
+        Key("min_range_m", _range_m, RANGE_M, "drop nearer points, m"),
+        Key("max_range_m", _range_m, RANGE_M, "drop farther points, m"),
+        Key("optional", Node.flag, FLAG, "may be absent from a recording", False),
+        Key("decode", _options, OPTIONS, "options of its decoder", {}),
+        Key(
+            "points",
+            _points,
+            POINTS.form,
+            "how decoded clouds are read; only with a topic, or files of sweeps",
+            (None, None),
+        ),
+    ),
+    required=("name",),
 )
-_CONVERT: Key[tuple[RigOption, ...]] = Key(
-    "convert",
-    convert_keys.read_options,
-    (),
-    convert_keys.FORM,
-    "options of `mlbatch convert`; the command line overrides them",
+RIG = Section(
+    (
+        # Fleets put the name of the robot before a slash.
+        _word_key(
+            "body_frame",
+            "a frame name of letters, digits, _ and / that does not start with a digit",
+            "frame of all points",
+            _FRAME,
+            text_form(r"/?[A-Za-z_][A-Za-z0-9_]*(/[A-Za-z_][A-Za-z0-9_]*)*"),
+        ),
+        Key(
+            "rate_hz",
+            _rate,
+            {"anyOf": [{**NUMBER, "exclusiveMinimum": 0}, text_form(r"[0-9./]+")]},
+            "scans per second: 10, 29.97, 10/3",
+        ),
+        Key(
+            "sensors",
+            _sensors,
+            {"type": "array", "items": SENSOR.form, "minItems": 1, "maxItems": MAX_SENSORS},
+            "sensors in the order of lidar_id",
+        ),
+        Key(
+            "exclude_boxes_m",
+            _boxes,
+            {"type": "array", "items": numbers_form(6)},
+            "boxes x0, y0, z0, x1, y1, z1, m, body frame, without points",
+            no_boxes(),
+        ),
+        Key(
+            "convert",
+            read_options,
+            CONVERT.form,
+            "options of `mlbatch convert`; the command line overrides them",
+            (),
+        ),
+        DATASET_KEY,
+    ),
+    required=("sensors",),
 )
-_RIG_KEYS = (_BODY_FRAME, _RATE, _SENSORS, _BOXES, _CONVERT, DATASET_KEY)
-_REQUIRED = ("sensors",)
 
 
 def rig_schema() -> dict[str, object]:
@@ -581,72 +527,56 @@ def rig_schema() -> dict[str, object]:
     return {
         "$schema": "https://json-schema.org/draft/2020-12/schema",
         "title": "Rig of mlbatch",
-        **mapping_form(_RIG_KEYS, required=_REQUIRED),
+        **RIG.form,
     }
 
 
 def rig_from(root: Node) -> Rig:
     """Return the rig that a tree describes; RigError for the first mistake."""
-    fields = root.fields(names(_RIG_KEYS), required=_REQUIRED)
-    body_frame = _BODY_FRAME.of(fields) or DEFAULT_BODY_FRAME
+    values = RIG.read(root)
+    body_frame = values["body_frame"] or DEFAULT_BODY_FRAME
     rig = Rig(
         body_frame=body_frame,
-        rate=_RATE.of(fields),
-        sensors=tuple(_sensor(item, body_frame) for item in _SENSORS.of(fields)),
-        exclude_boxes_m=_BOXES.of(fields),
-        options=_CONVERT.of(fields),
-        dataset=DATASET_KEY.of(fields),
+        rate=values["rate_hz"],
+        sensors=tuple(_sensor(item, body_frame) for item in values["sensors"]),
+        exclude_boxes_m=values["exclude_boxes_m"],
+        options=values["convert"],
+        dataset=values[DATASET],
     )
-    _check_distinct(fields["sensors"], rig)
+    _check_distinct(root.entries["sensors"], rig)
     return rig
 
 
-def _rpy_deg(fields: Mapping[str, Node]) -> tuple[float, ...]:
-    """Return roll, pitch and yaw of the extrinsics as given, or none."""
-    node = fields.get("extrinsics")
-    if node is None or "rotation_rpy_deg" not in node.entries:
-        return ()
-    return tuple(_ROTATION_RPY.of(node.entries))
-
-
 def _sensor(node: Node, body_frame: str) -> RigSensor:
-    fields = node.fields(names(_SENSOR_KEYS), required=("name",))
-    clock = _CLOCK.of(fields)
-    stream = _STREAM.of(fields)
-    sweeps = _sweeps(fields["points"]) if "points" in fields else None
+    values = SENSOR.read(node)
+    fields = node.entries
+    points, sweeps = values.pop("points")
+    clock = values.pop("clock")
     if sweeps is not None:
         if "stream" in fields:
             found = f"glob as well (line {fields['points'].entries['glob'].line})"
             raise fields["stream"].error("a stream without glob", found, "keep one of the two")
-        sweeps = sweeps._replace(glob=sweeps.glob.replace("{sensor}", _SENSOR_NAME.of(fields)))
-        stream = StreamSelector(topic=sweeps.glob)
-    given = _EXTRINSICS.of(fields)
+        sweeps = sweeps._replace(glob=sweeps.glob.replace("{sensor}", values["name"]))
+        values["stream"] = StreamSelector(topic=sweeps.glob)
+    stream = values["stream"]
+    given = values.pop("extrinsics")
     extrinsics, files = _of_files(given, body_frame, "" if stream is None else stream.serial)
+    rotation = fields["extrinsics"].entries.get("rotation_rpy_deg") if given is not None else None
     sensor = RigSensor(
-        name=_SENSOR_NAME.of(fields),
-        model=_MODEL.of(fields),
-        stream=stream,
-        metadata=_METADATA.of(fields),
+        **values,
+        **clock,
         extrinsics=extrinsics,
         extrinsics_files=files,
-        rotation_rpy_deg=_rpy_deg(fields),
-        clock=_CLOCK_SOURCE.of(clock) or None,
-        epoch=_CLOCK_EPOCH.of(clock) or None,
-        offset_ns=_CLOCK_OFFSET.of(clock),
-        min_range_m=_MIN_RANGE.of(fields),
-        max_range_m=_MAX_RANGE.of(fields),
-        optional=_OPTIONAL.of(fields),
-        decode=_DECODE.of(fields),
-        points=_POINTS.of(fields),
+        rotation_rpy_deg=() if rotation is None else tuple(rotation.numbers(3)),
+        points=points,
         sweeps=sweeps,
     )
-    if sensor.points is not None and (sensor.stream is None or not sensor.stream.topic):
-        points = fields["points"]
+    if points is not None and (stream is None or not stream.topic):
         remedy = (
             "give the topic of its clouds as stream: {topic: ...}, files of sweeps as glob, or "
             "remove points"
         )
-        raise points.error("a sensor on a topic", "none", remedy)
+        raise fields["points"].error("a sensor on a topic", "none", remedy)
     low_m = sensor.min_range_m or 0.0
     high_m = sensor.max_range_m
     if high_m is not None and high_m <= low_m:
@@ -693,22 +623,6 @@ def _check_distinct(node: Node, rig: Rig) -> None:
 def _repeated(node: Node, what: str, first: Node, remedy: str) -> RigError:
     found = f"that of {first.path} (line {first.line}) again"
     return node.error(f"{what} of its own", found, remedy)
-
-
-def _some_fields(node: Node, known: Sequence[str]) -> Mapping[str, Node]:
-    """Return the entries of a mapping that must not be empty; check keys that exclude others."""
-    fields = node.fields(known)
-    if not fields:
-        raise node.error(f"at least one of {', '.join(known)}", "none", "add one of them")
-    for key, others in _EXCLUDES.items():
-        for other in others:
-            if key in fields and other in fields:
-                found = f"{other} as well (line {fields[other].line})"
-                raise fields[key].error(f"{key} without {other}", found, "keep one of the two")
-    for key, other in _NEEDS.items():
-        if key in fields and key in known and other not in fields:
-            raise fields[key].error(f"{key} with {other}", f"no {other}", f"add the {other}")
-    return fields
 
 
 def _check_near(node: Node, value_m: float) -> None:
