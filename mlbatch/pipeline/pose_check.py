@@ -119,7 +119,7 @@ class PoseCheck:
             self._is_over = self._comparison.is_settled
 
     def _clouds(self) -> list[Cloud]:
-        """The points of each lidar in the newest window."""
+        """Take the points of each lidar in the newest window."""
         from mlbatch.poses.solve import Cloud
 
         clouds = []
@@ -128,6 +128,7 @@ class PoseCheck:
             origin_m = self._sensors[lidar].body_from_sensor[:3, 3]
             time_s = (stamp_ns - self._instant_ns) / NS_PER_S
             clouds.append(Cloud(lidar, points_m, time_s, origin_m))
+        self._parts = []
         return clouds
 
 

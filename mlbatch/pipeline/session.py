@@ -39,10 +39,10 @@ CLOUDS = "clouds"
 
 # Share of the bytes of a recording.
 _MOST = 0.5
-# Packets of each sensor to read at a time, between 4 MB and 8 MB in all: each batch costs some
+# Packets of each sensor to read at a time, between 4 MB and 5 MB in all: each batch costs some
 # calls a sensor, the columns of many small packets do not fit into the cache, and memory grows.
 _READ_PACKETS = 512
-_MOST_READ_BYTES = 8 << 20
+_MOST_READ_BYTES = 5 << 20
 
 
 class Session:
