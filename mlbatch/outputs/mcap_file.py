@@ -1,4 +1,4 @@
-"""MCAP files: records, chunks and their checksums; who checks the indexes listens.
+"""MCAP files: records, chunks and their checksums, and messages by the indexes of the file.
 
 `mcap` parses the records. Source: mcap.dev/spec.
 """
@@ -16,15 +16,16 @@ import zstandard
 from isal.isal_zlib import crc32
 from mcap.records import (
     Attachment,
+    AttachmentIndex,
     Channel,
     Chunk,
     Header,
     McapRecord,
     MessageIndex,
     Metadata,
+    MetadataIndex,
     Schema,
 )
-from mcap.records import Message as McapMessage
 from mcap.stream_reader import StreamReader
 
 from mlbatch.outputs.containers import (
@@ -45,12 +46,12 @@ _FOOTER_BYTES = _HEAD.size + 20
 # Of a chunk: all but compression and records.
 _CHUNK_BYTES = 40
 _HEADER = 1
-_MESSAGE = 5
-_CHUNK = 6
-_MESSAGE_INDEX = 7
+MESSAGE = 5
+CHUNK = 6
+MESSAGE_INDEX = 7
 _ATTACHMENT = 9
 _METADATA = 12
-_DATA_END = 15
+DATA_END = 15
 _PIECE_BYTES = 1 << 20
 
 
@@ -65,37 +66,14 @@ class Place:
     size: int
 
 
-class RecordListener:
-    """Gets every record that `McapFile` reads. This base class ignores them."""
-
-    def record(self, place: Place, record: McapRecord) -> None:
-        """A header, metadata, attachment, chunk or message index."""
-
-    def chunk(self, place: Place, size: int) -> None:
-        """A chunk whose checksum is right; size: of its records."""
-
-    def inner(self, offset: int, record: McapRecord, where: str) -> None:
-        """A record in a chunk; where: name of a message."""
-
-    def chunk_end(self, where: str, chunk: Chunk) -> None:
-        """The end of a chunk; all its records were read."""
-
-    def indexes_end(self) -> None:
-        """The end of the message indexes after a chunk."""
-
-    def damage(self) -> None:
-        """A chunk or message index that cannot be read."""
-
-    def summary(self, data: bytes, at: int) -> None:
-        """The bytes after the data section, from byte `at` on."""
-
-
 class McapFile:
-    """An MCAP file of mlbatch; its metadata and attachments are read at once."""
+    """An MCAP file of mlbatch; its metadata and attachments are read at once.
 
-    def __init__(
-        self, log: CheckLog, path: Path, where: str, listener: RecordListener | None = None
-    ) -> None:
+    described: index records of these, as the summary should have them.
+    """
+
+    def __init__(self, log: CheckLog, path: Path, where: str) -> None:
+        self.described: list[McapRecord] = []
         self.metadata: dict[str, dict[str, str]] = {}
         self.attachments: dict[str, bytes] = {}
         self.profile = ""
@@ -103,10 +81,8 @@ class McapFile:
         self._log = log
         self._path = path
         self._where = where
-        self._listener = listener or RecordListener()
         self._schemas: dict[int, str] = {}
         self._channels: dict[int, tuple[str, str, str]] = {}
-        self._counts: Counter[int] = Counter()
         # Offset and records of the chunk that `message_at` read last.
         self._last = (0, b"")
         with BoundedFile(path) as file:
@@ -123,7 +99,7 @@ class McapFile:
         """All records to the end of the data section."""
         at = len(MCAP_MAGIC)
         opcode = 0
-        while opcode != _DATA_END:
+        while opcode != DATA_END:
             opcode = 0
             length = 0
             if at + _HEAD.size <= file.size:
@@ -140,47 +116,31 @@ class McapFile:
 
     def _describe_file(self, file: BoundedFile, place: Place) -> None:
         """Read a header, metadata or attachment record."""
-        data = _bytes_of(file, place)
+        data = bytes_of(file, place)
         _, record = next(records_of(data))
         if isinstance(record, Header):
             self.profile = record.profile
             self.library = record.library
         elif isinstance(record, Metadata):
             self.metadata[record.name] = record.metadata
+            self.described.append(MetadataIndex(place.at, place.size, record.name))
         elif isinstance(record, Attachment):
             self.attachments[record.name] = record.data
             # The library skips this checksum.
             actual = crc32(memoryview(data)[_HEAD.size : -4], 0)
             stored = int.from_bytes(data[-4:], "little")
             self._log.equal("container", f"{self._where} {record.name} CRC", actual, stored)
-        self._listener.record(place, record)
-
-    def messages(self) -> Iterator[Message]:
-        """All messages in the order of the file."""
-        listener = self._listener
-        with BoundedFile(self._path) as file:
-            summary_at = 0
-            for place in self._places(file):
-                summary_at = place.at + place.size
-                if place.opcode in (_CHUNK, _DATA_END):
-                    listener.indexes_end()
-                if place.opcode == _MESSAGE:
-                    where = f"{self._where} byte {place.at}"
-                    self._log.fail("container", where, "messages in chunks", "one outside")
-                if place.opcode not in (_CHUNK, _MESSAGE_INDEX):
-                    continue
-                name = "chunk" if place.opcode == _CHUNK else "message index"
-                try:
-                    _, record = next(records_of(_bytes_of(file, place)))
-                    listener.record(place, record)
-                    if isinstance(record, Chunk):
-                        yield from self._chunk_messages(place, record)
-                except DamageError as err:
-                    listener.damage()
-                    where = f"{self._where} {name} at byte {place.at}"
-                    self._log.fail("container", where, err.expected, err.found)
-            file.seek(summary_at)
-            listener.summary(file.read(), summary_at)
+            self.described.append(
+                AttachmentIndex(
+                    offset=place.at,
+                    length=place.size,
+                    log_time=record.log_time,
+                    create_time=record.create_time,
+                    data_size=len(record.data),
+                    name=record.name,
+                    media_type=record.media_type,
+                )
+            )
 
     def places(self, topics: Collection[str]) -> list[MessagePlace]:
         """Where the messages of topics are, in the order of the file, by its indexes."""
@@ -190,9 +150,9 @@ class McapFile:
             end = 0
             for place in self._places(file):
                 end = place.at + place.size
-                chunk = place if place.opcode == _CHUNK else chunk
-                if place.opcode == _MESSAGE_INDEX:
-                    _, record = next(records_of(_bytes_of(file, place)))
+                chunk = place if place.opcode == CHUNK else chunk
+                if place.opcode == MESSAGE_INDEX:
+                    _, record = next(records_of(bytes_of(file, place)))
                     if isinstance(record, MessageIndex):
                         own = ((chunk, offset, log_ns) for log_ns, offset in record.records)
                         entries += [(*entry, record.channel_id) for entry in own]
@@ -215,8 +175,8 @@ class McapFile:
         # Messages that follow each other are often of one chunk.
         if self._last[0] != place.chunk:
             with BoundedFile(self._path) as file:
-                chunk = Place(_CHUNK, place.chunk, place.chunk_bytes)
-                _, record = next(records_of(_bytes_of(file, chunk)))
+                chunk = Place(CHUNK, place.chunk, place.chunk_bytes)
+                _, record = next(records_of(bytes_of(file, chunk)))
             if not isinstance(record, Chunk):
                 raise DamageError(f"a chunk at byte {place.chunk}", type(record).__name__)
             whole = self._chunk_data(log, chunk, record)
@@ -231,7 +191,7 @@ class McapFile:
         opcode, length, channel, _, log_ns, publish_ns = _MESSAGE_HEAD.unpack(head)
         topic, kind, encoding = self._channels.get(channel, ("", "", ""))
         end = place.offset + _HEAD.size + length
-        if (opcode, topic, log_ns) != (_MESSAGE, place.topic, place.log_ns) or end > len(data):
+        if (opcode, topic, log_ns) != (MESSAGE, place.topic, place.log_ns) or end > len(data):
             raise DamageError(f"a message at offset {place.offset}, as by the index", "another")
         where = f"{self._where} {topic} message {place.number}"
         content = memoryview(data)[begin:end]
@@ -257,39 +217,9 @@ class McapFile:
         is_right = log.equal("container", f"{where} CRC", f"{crc32(data, 0):08x}", crc)
         return data if is_right else None
 
-    def _chunk_messages(self, place: Place, record: Chunk) -> Iterator[Message]:
-        where = f"{self._where} chunk at byte {place.at}"
-        data = self._chunk_data(self._log, place, record)
-        if data is None:
-            return
-        self._listener.chunk(place, len(data))
-        for offset, inner in records_of(data):
-            if isinstance(inner, McapMessage):
-                message = self._message(inner)
-                self._listener.inner(offset, inner, message.where)
-                yield message
-                continue
-            if not isinstance(inner, Channel | Schema):
-                found = f"{type(inner).__name__} at {offset}"
-                raise DamageError("a schema, channel or message", found)
-            self._learn(inner)
-            self._listener.inner(offset, inner, "")
-        self._listener.chunk_end(where, record)
 
-    def _message(self, message: McapMessage) -> Message:
-        channel = self._channels.get(message.channel_id)
-        if channel is None:
-            raise DamageError("a message of a channel before it", f"channel {message.channel_id}")
-        topic, kind, encoding = channel
-        number = self._counts[message.channel_id]
-        self._counts[message.channel_id] += 1
-        where = f"{self._where} {topic} message {number}"
-        return Message(
-            where, topic, kind, encoding, message.log_time, message.publish_time, message.data
-        )
-
-
-def _bytes_of(file: BoundedFile, place: Place) -> bytes:
+def bytes_of(file: BoundedFile, place: Place) -> bytes:
+    """The bytes of a record."""
     file.seek(place.at)
     return file.read(place.size)
 

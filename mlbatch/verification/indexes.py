@@ -7,28 +7,38 @@ from __future__ import annotations
 
 import zlib
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import NamedTuple, TypeAlias
 
 from mcap.records import (
-    Attachment,
     AttachmentIndex,
     Channel,
     Chunk,
     ChunkIndex,
     Footer,
     McapRecord,
-    Message,
     MessageIndex,
-    Metadata,
     MetadataIndex,
     Schema,
     Statistics,
 )
+from mcap.records import Message as McapMessage
 
+from mlbatch.outputs.containers import BoundedFile, Message
 from mlbatch.outputs.damage import CheckLog, DamageError
-from mlbatch.outputs.mcap_file import MCAP_MAGIC, Place, RecordListener, records_of
+from mlbatch.outputs.mcap_file import (
+    CHUNK,
+    DATA_END,
+    MCAP_MAGIC,
+    MESSAGE,
+    MESSAGE_INDEX,
+    McapFile,
+    Place,
+    bytes_of,
+    records_of,
+)
 from mlbatch.outputs.rosbag2 import METADATA, Yaml, value_at
 
 # Of metadata.yaml.
@@ -39,18 +49,14 @@ Index: TypeAlias = dict[int, list[tuple[int, int]]]
 
 @dataclass(slots=True)
 class _ChunkFound:
-    """Data read from one chunk and its message indexes."""
+    """A chunk, what was read from it, and from the message indexes after it."""
 
     place: Place
-    compression: str
-    # Bytes in the file, and uncompressed.
-    stored_size: int
-    size: int = 0
-    # False where the chunk is damaged: its messages are not known.
-    whole: bool = False
-    # (log time, offset) of the messages found, by channel.
+    record: Chunk
+    # Uncompressed bytes; None where the chunk is damaged: its messages are not known.
+    size: int | None = None
+    # (log time, offset) of the messages found, by channel; the same as the indexes have it.
     messages: Index = field(default_factory=dict)
-    # The same as the message indexes have it.
     indexed: Index = field(default_factory=dict)
     # Offset of the message index of each channel; bytes of all.
     index_at: dict[int, int] = field(default_factory=dict)
@@ -62,113 +68,112 @@ class _ChunkFound:
         times_ns = [log_ns for own in self.messages.values() for log_ns, _ in own]
         return min(times_ns, default=0), max(times_ns, default=0)
 
-    def index_record(self) -> McapRecord:
-        """The record that the summary should contain."""
-        first_ns, last_ns = self.span_ns
-        return ChunkIndex(
-            chunk_length=self.place.size,
-            chunk_start_offset=self.place.at,
-            compression=self.compression,
-            compressed_size=self.stored_size,
-            message_end_time=last_ns,
-            message_index_length=self.index_bytes,
-            message_index_offsets=self.index_at,
-            message_start_time=first_ns,
-            uncompressed_size=self.size,
-        )
 
+class CheckedMcap(McapFile):
+    """A file whose chunks and indexes are checked as its messages are read."""
 
-class McapIndexChecks(RecordListener):
-    """Checks of one file; where: its name."""
-
-    def __init__(self, log: CheckLog, where: str) -> None:
-        # First and last log time, after all messages are read.
-        self.span_ns = (0, 0)
-        self._log = log
-        self._where = where
-        self._chunk: _ChunkFound | None = None
-        self._damaged = False
+    def __init__(self, log: CheckLog, path: Path) -> None:
+        super().__init__(log, path, path.name)
         self._spans_ns: list[tuple[int, int]] = []
-        self._channels: set[int] = set()
-        self._schemas: set[int] = set()
+        self._is_damaged = False
+        self._chunks: list[McapRecord] = []
         self._counts: Counter[int] = Counter()
-        # Index records that the summary should contain.
-        self._expected: dict[type[McapRecord], list[McapRecord]] = {
-            kind: [] for kind in (ChunkIndex, Statistics, AttachmentIndex, MetadataIndex)
-        }
 
-    def record(self, place: Place, record: McapRecord) -> None:
-        """Note what the summary should say of a record."""
-        if isinstance(record, Metadata):
-            self._expected[MetadataIndex].append(MetadataIndex(place.at, place.size, record.name))
-        elif isinstance(record, Attachment):
-            self._expected[AttachmentIndex].append(
-                AttachmentIndex(
-                    offset=place.at,
-                    length=place.size,
-                    log_time=record.log_time,
-                    create_time=record.create_time,
-                    data_size=len(record.data),
-                    name=record.name,
-                    media_type=record.media_type,
-                )
-            )
-        elif isinstance(record, Chunk):
-            self._chunk = _ChunkFound(place, record.compression, len(record.data))
-        elif isinstance(record, MessageIndex) and self._chunk is not None:
-            self._chunk.indexed[record.channel_id] = record.records
-            self._chunk.index_at[record.channel_id] = place.at
-            self._chunk.index_bytes += place.size
+    @property
+    def span_ns(self) -> tuple[int, int]:
+        """First and last log time, after all messages are read."""
+        firsts, lasts = zip(*self._spans_ns or [(0, 0)], strict=True)
+        return min(firsts), max(lasts)
 
-    def chunk(self, place: Place, size: int) -> None:
-        """Note the size of a chunk that can be read."""
-        if self._chunk is not None:
-            self._chunk.size = size
-            self._chunk.whole = True
+    def messages(self) -> Iterator[Message]:
+        """All messages in the order of the file."""
+        chunk: _ChunkFound | None = None
+        with BoundedFile(self._path) as file:
+            end = 0
+            for place in self._places(file):
+                end = place.at + place.size
+                if place.opcode in (CHUNK, DATA_END):
+                    self._check_chunk(chunk)
+                    chunk = None
+                if place.opcode == MESSAGE:
+                    where = f"{self._where} byte {place.at}"
+                    self._log.fail("container", where, "messages in chunks", "one outside")
+                if place.opcode not in (CHUNK, MESSAGE_INDEX):
+                    continue
+                name = "chunk" if place.opcode == CHUNK else "message index"
+                try:
+                    _, record = next(records_of(bytes_of(file, place)))
+                    if isinstance(record, Chunk):
+                        chunk = _ChunkFound(place, record)
+                        yield from self._messages_of(chunk)
+                    elif isinstance(record, MessageIndex) and chunk is not None:
+                        chunk.indexed[record.channel_id] = record.records
+                        chunk.index_at[record.channel_id] = place.at
+                        chunk.index_bytes += place.size
+                except DamageError as err:
+                    self._is_damaged = True
+                    where = f"{self._where} {name} at byte {place.at}"
+                    self._log.fail("container", where, err.expected, err.found)
+            file.seek(end)
+            self._check_summary(file.read(), end)
 
-    def inner(self, offset: int, record: McapRecord, where: str) -> None:
-        """Count a message, schema or channel."""
-        if isinstance(record, Channel):
-            self._channels.add(record.id)
-        elif isinstance(record, Schema):
-            self._schemas.add(record.id)
-        elif isinstance(record, Message) and self._chunk is not None:
-            number = self._counts[record.channel_id]
-            self._counts[record.channel_id] += 1
-            self._log.equal("container", f"{where} sequence", number, record.sequence)
-            own = self._chunk.messages.setdefault(record.channel_id, [])
-            own.append((record.log_time, offset))
+    def _messages_of(self, chunk: _ChunkFound) -> Iterator[Message]:
+        data = self._chunk_data(self._log, chunk.place, chunk.record)
+        if data is None:
+            return
+        chunk.size = len(data)
+        for offset, inner in records_of(data):
+            if isinstance(inner, McapMessage):
+                yield self._message(chunk, offset, inner)
+            elif isinstance(inner, Channel | Schema):
+                self._learn(inner)
+            else:
+                found = f"{type(inner).__name__} at {offset}"
+                raise DamageError("a schema, channel or message", found)
+        where = f"{self._where} chunk at byte {chunk.place.at} first and last"
+        said_ns = (chunk.record.message_start_time, chunk.record.message_end_time)
+        self._log.equal("container", where, chunk.span_ns, said_ns)
 
-    def chunk_end(self, where: str, chunk: Chunk) -> None:
-        """Check the times in the header of a chunk."""
-        found = (0, 0) if self._chunk is None else self._chunk.span_ns
-        said_ns = (chunk.message_start_time, chunk.message_end_time)
-        self._log.equal("container", f"{where} first and last", found, said_ns)
+    def _message(self, chunk: _ChunkFound, offset: int, message: McapMessage) -> Message:
+        number = message.channel_id
+        if number not in self._channels:
+            raise DamageError("a message of a channel before it", f"channel {number}")
+        topic, kind, encoding = self._channels[number]
+        where = f"{self._where} {topic} message {self._counts[number]}"
+        self._log.equal("container", f"{where} sequence", self._counts[number], message.sequence)
+        self._counts[number] += 1
+        log_ns = message.log_time
+        chunk.messages.setdefault(number, []).append((log_ns, offset))
+        return Message(where, topic, kind, encoding, log_ns, message.publish_time, message.data)
 
-    def damage(self) -> None:
-        """The messages of some chunks are not known."""
-        self._damaged = True
-
-    def indexes_end(self) -> None:
-        """Check the message indexes of the last chunk; nothing but its index record is kept."""
-        chunk = self._chunk
+    def _check_chunk(self, chunk: _ChunkFound | None) -> None:
+        """Check the message indexes after a chunk; nothing but its index record is kept."""
         if chunk is None:
             return
-        self._chunk = None
-        if not chunk.whole:
-            self._damaged = True
+        if chunk.size is None:
+            self._is_damaged = True
             return
         where = f"{self._where} message indexes after the chunk at byte {chunk.place.at}"
         self._log.equal("container", where, chunk.messages, chunk.indexed)
-        self._expected[ChunkIndex].append(chunk.index_record())
+        first_ns, last_ns = chunk.span_ns
+        self._chunks.append(
+            ChunkIndex(
+                chunk_length=chunk.place.size,
+                chunk_start_offset=chunk.place.at,
+                compression=chunk.record.compression,
+                compressed_size=len(chunk.record.data),
+                message_end_time=last_ns,
+                message_index_length=chunk.index_bytes,
+                message_index_offsets=chunk.index_at,
+                message_start_time=first_ns,
+                uncompressed_size=chunk.size,
+            )
+        )
         if chunk.messages:
             self._spans_ns.append(chunk.span_ns)
-            firsts, lasts = zip(*self._spans_ns, strict=True)
-            self.span_ns = (min(firsts), max(lasts))
-            self._spans_ns = [self.span_ns]
 
-    def summary(self, data: bytes, at: int) -> None:
-        """Check the summary section against what was read."""
+    def _check_summary(self, data: bytes, at: int) -> None:
+        """Check the bytes after the data section, from byte `at` on, against what was read."""
         log = self._log
         where = self._where
         if not log.equal("container", f"{where} last bytes", MCAP_MAGIC, data[-len(MCAP_MAGIC) :]):
@@ -185,34 +190,32 @@ class McapIndexChecks(RecordListener):
             return
         footers = [record.summary_start for record in records if isinstance(record, Footer)]
         log.equal("container", f"{where} start of the summary", [at], footers)
-        if self._damaged:
+        if self._is_damaged:
             return
-        self._expected[Statistics].append(self._statistics())
-        for kind, own in self._expected.items():
+        should = [*self._chunks, self._statistics(), *self.described]
+        for kind in (ChunkIndex, Statistics, AttachmentIndex, MetadataIndex):
             name = f"{where} {kind.__name__}"
-            found = [record for record in records if isinstance(record, kind)]
+            own, found = (
+                [one for one in side if isinstance(one, kind)] for side in (should, records)
+            )
             log.equal("container", f"{name} records", len(own), len(found))
             for number, (one, other) in enumerate(zip(own, found, strict=False)):
-                left = vars(one)
-                right = vars(other)
+                left, right = vars(one), vars(other)
                 differs = [key for key in left if left[key] != right[key]]
-                log.equal(
-                    "container",
-                    f"{name} {number}",
-                    {key: left[key] for key in differs},
-                    {key: right[key] for key in differs},
-                )
+                sides = ({key: side[key] for key in differs} for side in (left, right))
+                log.equal("container", f"{name} {number}", *sides)
 
     def _statistics(self) -> McapRecord:
+        attachments = sum(isinstance(one, AttachmentIndex) for one in self.described)
         return Statistics(
-            attachment_count=len(self._expected[AttachmentIndex]),
+            attachment_count=attachments,
             channel_count=len(self._channels),
             channel_message_counts=dict(self._counts),
-            chunk_count=len(self._expected[ChunkIndex]),
+            chunk_count=len(self._chunks),
             message_count=self._counts.total(),
             message_end_time=self.span_ns[1],
             message_start_time=self.span_ns[0],
-            metadata_count=len(self._expected[MetadataIndex]),
+            metadata_count=len(self.described) - attachments,
             schema_count=len(self._schemas),
         )
 

@@ -132,14 +132,12 @@ def _check_mcap(
     output: Output, paths: Sequence[Path], name: str, about: Yaml | None = None
 ) -> Verdict:
     """about: metadata.yaml of a ROS 2 bag."""
-    from mlbatch.outputs.mcap_file import McapFile
-    from mlbatch.verification.indexes import BagFile, McapIndexChecks, check_metadata
+    from mlbatch.verification.indexes import BagFile, CheckedMcap, check_metadata
 
     log = output.log
-    indexes = [McapIndexChecks(log, path.name) for path in paths]
     mcaps = []
-    for path, index in zip(paths, indexes, strict=True):
-        file = McapFile(log, path, path.name, index)
+    for path in paths:
+        file = CheckedMcap(log, path)
         grid = file.metadata.get("mlbatch.grid")
         if grid is None:
             raise VerifyError(
@@ -166,7 +164,7 @@ def _check_mcap(
     topics = TopicChecks(log, metadata, _examination(output, files, metadata), files.report)
     counts = topics.check_files(mcaps, output.path.name if others else paths[0].name)
     if about is not None:
-        spans = (index.span_ns for index in indexes)
+        spans = (file.span_ns for file in mcaps)
         names = (path.name for path in paths)
         found = list(map(BagFile, names, counts, spans))
         check_metadata(log, about, found, topics.counts)
