@@ -9,7 +9,6 @@ from mlbatch.arrays import BoolArray, I64Array
 from mlbatch.batching.fill import EdgeGaps, FillMeter, Pace
 from mlbatch.types import NO_COLUMNS, ColumnFigures, WindowColumns
 
-NS_PER_S = 10**9
 # 1000 columns a revolution of 0.1 s.
 COLUMN_NS = 100_000
 PER_S = 10_000.0

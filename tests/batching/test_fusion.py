@@ -15,7 +15,6 @@ from mlbatch.types import NO_COLUMNS, WindowColumns
 from mlbatch.units import NS_PER_MS
 
 TICKS = 10
-STEP_NS = 10 * NS_PER_MS
 
 
 def test_every_word_but_that_of_windows_is_a_policy() -> None:

@@ -11,8 +11,6 @@ from rosbags.rosbag1 import Writer
 
 from tests.builders.bags import Recorded, definition
 
-# Field names and values of headers are free; rosbags never makes these.
-MESSAGE = 2
 CONNECTION = 7
 CHUNK = 5
 

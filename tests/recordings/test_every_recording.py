@@ -49,7 +49,6 @@ from tests.recordings import RECORDINGS
 from tests.recordings.references import assert_same_points, converted
 
 NS_PER_S = 10**9
-HOUR_NS = 3600 * NS_PER_S
 
 
 @dataclass(frozen=True, slots=True)

@@ -21,23 +21,3 @@ def test_models_that_need_a_file_have_advice(model: SensorModel) -> None:
     kinds = re.findall(r"\b(?:JSON|csv|dat|db\.xml)\b", model.calibration)
     assert kinds
     assert all(kind in advice for kind in kinds)
-
-
-@pytest.mark.parametrize(
-    ("what", "words"),
-    [
-        ("Ouster lidar, serial 111, 1280 bytes: needs its metadata", "/api/v1/sensor/metadata"),
-        ("HESAI lidar PandarXT-16, strongest return", "angle correction file (csv"),
-        ("HESAI lidar AT128, strongest return", "correction file (.dat"),
-        ("Velodyne HDL-64E S2", "db.xml"),
-        ("ROBOSENSE lidar RS-16", "DIFOP packets (UDP port 7788"),
-        ("Velodyne lidar VLP-16, dual return", ""),
-        ("Livox lidar (SDK2), coordinates", ""),
-        ("unknown", ""),
-    ],
-)
-def test_the_file_and_its_source_are_named(what: str, words: str) -> None:
-    advice = calibration_advice(what)
-    assert words in advice
-    assert bool(advice) == bool(words)
-    assert "\n" not in advice

@@ -6,7 +6,6 @@ Bytes of HESAI families are laid out by hand for the decoder (`hesai/test_points
 
 from __future__ import annotations
 
-import math
 from datetime import datetime
 
 import numpy as np
@@ -118,45 +117,6 @@ def test_bytes_of_a_velodyne(spec: VelodyneSpec, expected: str) -> None:
 def test_stamps_of_a_velodyne(spec: VelodyneSpec, first_us: int, second_us: int) -> None:
     stamps_us = counted(spec, 2)[:, 1200:1204].copy().view("<u4")[:, 0]
     assert stamps_us.tolist() == [first_us, second_us]
-
-
-@pytest.mark.parametrize(
-    ("spec", "laser", "direction", "origin_m"),
-    [
-        # To the right; 1 degree up, 2.304 us late: 0.0082944 degrees on.
-        (
-            VelodyneSpec("VLP-16", start_azimuth_deg=90),
-            *(1, (-1.447423e-4, -0.9998477, 0.0174524), None),
-        ),
-        (VelodyneSpec("VLP-16"), 0, None, pytest.approx((0, 0, 0.01123), abs=1e-12)),
-        # 1.4 degrees clockwise and 25 down; 42.4 mm x tan 25 degrees.
-        (
-            VelodyneSpec("VLP-32C"),
-            *(0, (0.9060373, -0.0221430, -0.4226183), pytest.approx((0, 0, 0.0197714), abs=5e-8)),
-        ),
-        # At beam azimuth 0 a positive horizontal offset moves the beam to the left (section 10).
-        (
-            VelodyneSpec("HDL-64E S2", start_azimuth_deg=-4.5),
-            *(0, None, pytest.approx((0, 0.026, 0.2), abs=1e-12)),
-        ),
-    ],
-)
-def test_rays_of_a_velodyne(
-    spec: VelodyneSpec,
-    laser: int,
-    direction: tuple[float, ...] | None,
-    origin_m: object,
-) -> None:
-    if direction is not None:
-        found = spec.directions(1)[0, laser]
-        assert found == pytest.approx(direction, abs=1e-7)
-    if origin_m is not None:
-        assert spec.origins(1)[0, laser] == origin_m
-
-
-def test_azimuth_of_a_beam_of_a_vls_128() -> None:
-    x, y, _ = VelodyneSpec("VLS-128", rpm=0).directions(1)[0, 8].tolist()
-    assert math.degrees(math.atan2(-y, x)) == pytest.approx(6.354)
 
 
 def test_position_packets() -> None:

@@ -20,7 +20,7 @@ from mlbatch.sensors import describe
 from mlbatch.simulate.hesai.encode import HesaiSpec
 from mlbatch.simulate.hesai.models import MODELS as HESAI
 from mlbatch.simulate.robosense.encode import RobosenseSpec
-from mlbatch.simulate.robosense.models import AIRY_MOUNTS, LAST, NEAREST
+from mlbatch.simulate.robosense.models import AIRY_MOUNTS
 from mlbatch.simulate.robosense.models import MODELS as ROBOSENSE
 from mlbatch.simulate.spinning import SpinningSpec
 from mlbatch.simulate.velodyne.encode import VelodyneSpec
@@ -187,40 +187,6 @@ def test_what_was_sent_comes_back(case: Case) -> None:
 
 
 @pytest.mark.parametrize(
-    ("spec", "mode", "types"),
-    [
-        (VelodyneSpec("VLP-16", "strongest"), "strongest return", (1,)),
-        (VelodyneSpec("VLP-16", "last"), "last return", (2,)),
-        (VelodyneSpec("VLP-16", "dual"), "dual return", (0, 0)),
-        # Packets of an HDL-64E do not name the only return.
-        (VelodyneSpec("HDL-64E S3", "last"), "single return", (0,)),
-        (VelodyneSpec("HDL-64E S3", "dual"), "dual return", (0, 0)),
-        (HesaiSpec("XT32M2X", "strongest"), "strongest return", (1,)),
-        (HesaiSpec("XT32M2X", "last"), "last return", (2,)),
-        (HesaiSpec("XT32M2X", "first"), "first return", (0,)),
-        (HesaiSpec("XT32M2X", "dual"), "dual return, last and strongest", (0, 0)),
-        (HesaiSpec("XT32M2X", "triple"), "triple return, first, last and strongest", (0, 0, 0)),
-        *(
-            (RobosenseSpec(name, mode), f"single return, {word}", (number,))
-            for name in ("RS-16", "RS-32", "Bpearl v4", "Helios 16", "Ruby Plus 48")
-            for mode, word, number in (
-                *(("strongest", "strongest", 1), (LAST, "last", 2)),
-                (NEAREST, "first", 0),
-            )
-            if mode in ROBOSENSE[name].modes
-        ),
-        # Packets contain both returns of a shot and one of the next, or one and both.
-        (RobosenseSpec("Ruby 128", "dual"), "dual return, a column each", (0,)),
-        (RobosenseSpec("Ruby Plus 128", "dual"), "dual return, a column each", (0,)),
-    ],
-    ids=words_of,
-)
-def test_modes(spec: SpinningSpec, mode: str, types: tuple[int, ...]) -> None:
-    lidar = stream_of(spec).lidar()
-    assert (lidar.mode, lidar.return_types, lidar.returns) == (mode, types, len(types))
-
-
-@pytest.mark.parametrize(
     ("spec", "size", "modulus"),
     [
         (VelodyneSpec("VLP-16"), 1206, 0),
@@ -347,11 +313,3 @@ def test_a_rotor_at_rest_has_no_speed_and_no_blind_sector(
     assert np.abs(speed).max() < 2 * np.pi * 1e-9 * 0.1
     if jitter is None:
         assert not angle.any()
-
-
-def test_returns_of_128_lines_are_columns_of_one_time() -> None:
-    for name, round_ns in (("Ruby 128", 55_550), ("Ruby Plus 128", 55_560)):
-        stream = stream_of(RobosenseSpec(name, "dual"), packets=4)
-        stamp_ns = stream.headers(stream.lidar()).stamp_ns
-        begun_ns = stamp_ns - stamp_ns[:, :1]
-        assert begun_ns.tolist() == [[0, 0, round_ns], [0, round_ns, round_ns]] * 2

@@ -23,7 +23,6 @@ from mlbatch.simulate.ouster.encode import OusterSpec, encode_frame, imu_packet,
 from mlbatch.types import Stream
 from tests.builders.others import (
     filled,
-    livox1_packets,
     livox2_packets,
     rows,
     velodyne_packets,
@@ -67,10 +66,6 @@ def test_a_file_too_large_for_a_calibration_is_none(tmp_path: Path) -> None:
     with path.open("ab") as file:
         file.write(b" ")
     assert sensors.read_calibration(path) is None
-
-
-def test_no_vendor_knows_an_odd_packet() -> None:
-    assert sensors.describe(3, np.zeros((2, 3), np.uint8)) is None
 
 
 def test_a_damaged_packet_does_not_hide_a_stream() -> None:
@@ -197,12 +192,6 @@ def test_legacy_sizes_of_ouster(beams: int) -> None:
     for length in (size, size + 1):
         assert "ouster" in sensors.senders(length, np.zeros((1, length), np.uint8))
     assert sensors.senders(size - 1, np.zeros((1, size - 1), np.uint8)) == []
-
-
-def test_a_single_payload_is_a_sample() -> None:
-    packet = livox1_packets(1, 1362)[0]
-    assert sensors.senders(len(packet), packet) == ["livox"]
-    assert named(packet[None]) is None
 
 
 def test_every_vendor_has_both_conditions() -> None:

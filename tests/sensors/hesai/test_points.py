@@ -17,10 +17,10 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-from mlbatch.arrays import F32Array, I64Array
+from mlbatch.arrays import I64Array
 from mlbatch.lidar.interface import Lidar
-from mlbatch.simulate.hesai.encode import angles_csv, fan
-from tests.builders.decoded import readings
+from mlbatch.simulate.hesai.encode import angles_csv
+from tests.builders.decoded import Readings, readings
 from tests.builders.others import rows
 from tests.builders.spinning import evidence_of, fired, from_file
 
@@ -63,26 +63,15 @@ class Case:
     more: tuple[tuple[int, str], ...] = ()
 
 
-@dataclass(frozen=True)
-class Decoded:
-    """All columns of two equal packets."""
-
-    lidar: Lidar
-    range_m: F32Array
-    intensity: F32Array
-    xyz: F32Array
-    stamp_ns: I64Array
-    time_ns: I64Array
-
-
-def decode(packet: bytes, content: bytes, options: Mapping[str, str] | None = None) -> Decoded:
-    """Two packets like this, with an angle file."""
+def decode(
+    packet: bytes, content: bytes, options: Mapping[str, str] | None = None
+) -> tuple[Lidar, Readings, I64Array]:
+    """Two packets like this, with an angle file; times (columns, channels) of all firings, ns."""
     packets = rows([packet] * 2)
     lidar = from_file(content).lidar(options or {}, evidence_of(packets))
     assert not lidar.faults(packets).any()
     found = readings(lidar, packets)
-    time_ns, _, _ = fired(lidar, found.headers)
-    return Decoded(lidar, found.range_m, found.intensity, found.xyz, found.stamp_ns, time_ns)
+    return lidar, found, fired(lidar, found.headers)[0]
 
 
 def _starts(first: int, stride: int, count: int) -> tuple[int, ...]:
@@ -202,64 +191,21 @@ def _csv(case: Case) -> bytes:
 @pytest.mark.parametrize("case", CASES, ids=lambda case: f"{case.model}-{case.size}-{case.mode:x}")
 def test_hand_worked_points(case: Case, turning: bool) -> None:
     options = {} if turning else {"firing_azimuth": "off"}
-    found = decode(_packet(case), _csv(case), options)
-    assert found.lidar.model == case.model
+    lidar, found, time_ns = decode(_packet(case), _csv(case), options)
+    assert lidar.model == case.model
     # Nothing else came back, in either of the two packets.
     assert np.count_nonzero(found.range_m) == 2 * len(case.shots)
-    points = found.xyz
     for number, shot in enumerate(case.shots):
         place = shot.column, shot.channel, shot.which
         range_m = (2501 + number) * case.unit_mm / 1000
         assert found.range_m[place] == np.float32(range_m)
         assert found.intensity[place] == 17 * (number + 1)
-        assert found.time_ns[place[:2]] == PACKET_NS + shot.block_ns + shot.firing_ns
+        assert time_ns[place[:2]] == PACKET_NS + shot.block_ns + shot.firing_ns
         block_deg = 40 + 10 * shot.column
         turned_ns = shot.firing_ns + AZIMUTH_LAG_NS.get(case.model, 0)
         turned_deg = DEG_PER_NS * turned_ns if turning and case.model != "JT16" else 0.0
         expected = _point(block_deg + 1 + turned_deg, range_m)
-        assert points[place].tolist() == pytest.approx(expected, abs=2e-6)
-
-
-@pytest.mark.parametrize("rpm", [600, 1200])
-@pytest.mark.parametrize(
-    ("model", "step_us", "together"),
-    [("PandarXT-16", 3.024, 16), ("PandarXT-32", 1.512, 32), ("XT32M2X", 2.888, 16)],
-)
-def test_azimuths_of_an_xt_as_in_the_vendors_sdk(
-    model: str, step_us: float, together: int, rpm: int
-) -> None:
-    """Azimuth of a block + rpm x 6e-6 x firing time in us, by the SDK's files for these models."""
-    case = next(case for case in CASES if case.model == model)
-    packet = bytearray(_packet(case))
-    struct.pack_into("<H", packet, case.tail[1], rpm)
-    stride = 2 + 4 * case.channels
-    for channel in range(case.channels):
-        struct.pack_into("<H", packet, 14 + 4 * channel, 10_000)
-    found = decode(bytes(packet), angles_csv(fan(model, case.channels)[0], [0.0] * case.channels))
-    xyz = found.xyz[0, :, 0]
-    azimuth_deg = np.degrees(np.arctan2(xyz[:, 0], xyz[:, 1]))
-    number = np.arange(case.channels) % together
-    expected_deg = 40 + rpm * 6e-6 * (6 + step_us * number)
-    assert np.abs(azimuth_deg - expected_deg).max() < 2e-5
-    # Times stay those of the manual: 368 ns for the first channel.
-    groups = (case.size - 12) // stride // {0x37: 1, 0x3D: 3}[case.mode]
-    block_ns = 5632 - 50000 * (groups - 1)
-    expected_ns = PACKET_NS + block_ns + 368 + np.rint(step_us * 1000 * number).astype(int)
-    assert (found.time_ns[0] == expected_ns).all()
-
-
-def test_a_column_is_stamped_at_its_earliest_firing() -> None:
-    found = decode(_packet(CASES[0]), _csv(CASES[0]))
-    # Channel 8 of a Pandar40P is the first to fire, 54670 ns before the block's end.
-    assert found.stamp_ns[9] == PACKET_NS - 28580 - 54670
-    assert found.lidar.firing_ns.shape == (1, 40)
-    assert found.lidar.firing_ns[0, [0, 7, 11]].tolist() == [12450, 0, 46480]
-
-
-def test_channels_that_a_loop_leaves_out() -> None:
-    lidar = decode(_packet(CASES[1]), _csv(CASES[1])).lidar
-    assert (lidar.firing_ns[0] == -1).nonzero()[0].tolist() == list(range(32))
-    assert (lidar.firing_ns[1] == -1).nonzero()[0].tolist() == list(range(32, 64))
+        assert found.xyz[place].tolist() == pytest.approx(expected, abs=2e-6)
 
 
 @pytest.mark.parametrize(("raw", "range_m"), [(0, 0.0), (1, 0.0), (3, 0.0), (4, 0.016)])
@@ -267,19 +213,5 @@ def test_small_numbers_of_an_ot128_are_words(raw: int, range_m: float) -> None:
     case = next(case for case in CASES if case.model == "OT128")
     packet = bytearray(_packet(case))
     struct.pack_into("<H", packet, case.shots[1].at, raw)
-    found = decode(bytes(packet), _csv(case))
+    _, found, _ = decode(bytes(packet), _csv(case))
     assert found.range_m[1, 2, 0] == np.float32(range_m)
-
-
-@pytest.mark.parametrize("unit_mm", [1, 2, 3, 4, 5, 7, 250])
-def test_ranges_are_correctly_rounded(unit_mm: int) -> None:
-    case = next(case for case in CASES if case.model == "PandarXT-32")
-    raw = np.arange(510, 65536, 255).reshape(8, 32)
-    packet = bytearray(_packet(case))
-    packet[9] = unit_mm
-    for block, values in enumerate(raw.tolist()):
-        for channel, value in enumerate(values):
-            struct.pack_into("<H", packet, 14 + 130 * block + 4 * channel, value)
-    found = decode(bytes(packet), _csv(case))
-    # A quotient of float64 is so close that rounding it again hits the nearest float32.
-    assert (found.range_m[:8, :, 0] == (raw * unit_mm / 1000).astype(np.float32)).all()

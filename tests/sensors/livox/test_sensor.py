@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from mlbatch.arrays import F32Array, F64Array, I64Array, U8Array
-from mlbatch.errors import RigError
 from mlbatch.lidar.interface import FAULTS, Evidence
 from mlbatch.sensors.livox import sensor as livox
 from mlbatch.types import Stream
@@ -266,8 +265,3 @@ def test_fit() -> None:
     assert CALIBRATION.match_score(evidence(livox2_packets(0, 24, 1))) == 0
     assert CALIBRATION.match_score(evidence(livox1_packets(2, 1362))) == 0
     assert CALIBRATION.is_shared
-
-
-def test_points_of_the_first_kind_are_refused() -> None:
-    with pytest.raises(RigError, match="Livox SDK2: expected packets of points in the first 10"):
-        CALIBRATION.lidar({}, evidence(livox1_packets(2, 1362)))

@@ -3,23 +3,19 @@
 from __future__ import annotations
 
 import math
-from pathlib import Path
 
 import numpy as np
 import pytest
 
-import mlbatch
 from mlbatch import sensors
 from mlbatch.arrays import F32Array, F64Array, U8Array
 from mlbatch.frames.transforms import from_quaternion
 from mlbatch.lidar.interface import FAULTS, Calibration, Evidence, Lidar
-from mlbatch.ros.point_packets import Layout, Points, layout_of, pack
-from mlbatch.sensors.pointcloud.sensor import BUILT_IN, MODELS, CloudLidar
+from mlbatch.ros.point_packets import Layout, Points, pack
+from mlbatch.sensors.pointcloud.sensor import BUILT_IN, MODELS
 from mlbatch.types import Stream
 from tests.builders.decoded import readings
-from tests.builders.points import STAMP_NS, VELODYNE, cloud_message, write_points
-from tests.builders.rosbag2 import write_rosbag2
-from tests.builders.spinning import check_headers
+from tests.builders.points import STAMP_NS
 
 TOPIC = Stream(topic="/left/points")
 CLOUD, CUSTOM = BUILT_IN
@@ -82,17 +78,6 @@ def test_one_damaged_packet_hides_no_stream() -> None:
     packets, _ = _packets()
     packets[2] = 0
     assert CLOUD.match_score(_evidence(packets)) == 100
-
-
-def test_streams_are_described() -> None:
-    packets, _ = _packets()
-    words = "lidar points of a PointCloud2, up to 2 points a column in turn"
-    assert sensors.describe(packets.shape[1], packets) == words
-    alone = pack(_points(PLACES, [0, 1, 2, 3, 4]), Layout(1, 1), 0)
-    assert (
-        sensors.describe(alone.shape[1], alone)
-        == "lidar points of a CustomMsg, every point is a column"
-    )
 
 
 @pytest.mark.parametrize("by_ring", [False, True])
@@ -166,65 +151,3 @@ def test_points_are_turned_and_moved_into_the_body_frame() -> None:
     assert range_m.tolist() == RANGES_M
     expected = [(10 - y, 20 + x, 30 + z) for x, y, z in PLACES]
     np.testing.assert_allclose([*xyz[0], *xyz[1], xyz[2, 0]], expected, atol=2e-6)
-
-
-def test_columns_by_ring_are_named_so() -> None:
-    reals = np.ones((4, 16), np.float32)
-    nothing = np.zeros(16, np.uint8)
-    stamp_ns = np.full(16, STAMP_NS)
-    points = Points(stamp_ns, reals, np.arange(16, dtype=np.uint16), nothing, nothing)
-    layout = layout_of(points, 0)
-    lidar = CLOUD.lidar({}, _evidence(pack(points, layout, 0)))
-    assert lidar.mode == "up to 16 points a column by ring"
-
-
-HOST_NS = np.full(40, STAMP_NS)
-
-
-def _by_ring() -> tuple[Lidar, U8Array]:
-    """Forty columns of eight rings."""
-    nothing = np.zeros(320, np.uint8)
-    stamp_ns = STAMP_NS + np.repeat(np.arange(40), 8) * 55_296
-    reals = np.random.default_rng(3).random((4, 320)).astype(np.float32)
-    ring = np.tile(np.arange(8, dtype=np.uint16), 40)
-    layout = Layout(0, 16, by_ring=True)
-    packets = pack(Points(stamp_ns, reals, ring, nothing, nothing), layout, 0)
-    return CloudLidar(layout, "/top"), packets
-
-
-def test_headers_say_what_packets_literally_say() -> None:
-    """Each packet is a column; of another layout it is damage; times may fall."""
-    lidar, packets = _by_ring()
-    stamp_ns = check_headers(lidar, packets, HOST_NS).columns.stamp_ns[:, 0]
-    assert stamp_ns.tolist() == (STAMP_NS + np.arange(40) * 55_296).tolist()
-    assert not check_headers(lidar, packets[::-1], HOST_NS).faults.any()
-    packets[7, 5] = 1
-    assert check_headers(lidar, packets, HOST_NS).faults.any()
-
-
-def test_hashes_that_are_known_are_used() -> None:
-    lidar, packets = _by_ring()
-    keys = np.arange(40)
-    assert lidar.reader is not None
-    found = lidar.reader.read(packets.reshape(-1), keys * lidar.packet_size, HOST_NS, keys)
-    assert found.key.tolist() == keys.tolist()
-
-
-def test_points_with_times_of_their_own_keep_their_rings(tmp_path: Path) -> None:
-    """As of a Velodyne driver: a time and a ring for every point; two topics, rings run on."""
-    points = [(1.0 + i, 2.0, 3.0, 7.0, (5 * i) % 16, -0.1 + 1e-4 * i) for i in range(800)]
-    stamps = [STAMP_NS + k * 80_000_000 for k in range(4)]
-    messages = [
-        message
-        for topic in ("/a/points", "/b/points")
-        for message in write_points(topic, [cloud_message(VELODYNE, points, at) for at in stamps])
-    ]
-    bag = write_rosbag2(tmp_path / "clouds.cdr", messages)
-    scans = list(mlbatch.scans(bag, keep_partial=True, identity_extrinsics=True))
-    xyz, ring, lidar = (
-        np.concatenate([getattr(scan, name) for scan in scans])
-        for name in ("xyz", "ring", "lidar_id")
-    )
-    assert len(xyz) == 2 * 4 * 800
-    number = np.rint(xyz[:, 0] - 1).astype(int)
-    assert np.array_equal(ring, lidar.astype(int) * 128 + (5 * number) % 16)
