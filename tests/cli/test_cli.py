@@ -14,7 +14,6 @@ from pathlib import Path
 
 import pytest
 
-import mlbatch
 from tests.builders.sessions import CAPTURE, FIX, REPOSITORY, RIG, Report, Shell, names, report_of
 
 # Points of a window: fixtures/two_lidars/SOURCE.md.
@@ -95,13 +94,6 @@ def test_a_dry_run_ignores_the_output(shell: Shell) -> None:
     Path("out").mkdir()
     assert shell(f"convert {FIX} -o out --dry-run").code == 0
     assert list(Path("out").iterdir()) == []
-
-
-def test_the_version_and_the_help_go_to_stdout(shell: Shell) -> None:
-    version, help_ = shell("--version"), shell("convert --help-all")
-    assert (version.code, version.out) == (0, f"mlbatch {mlbatch.__version__}\n")
-    assert (help_.code, help_.err) == (0, "")
-    assert "--max-wait" in help_.out
 
 
 def test_sensors_as_table_and_as_json_agree(shell: Shell) -> None:

@@ -139,32 +139,6 @@ def test_partial_windows_and_slices_have_their_own_names(shell: Shell) -> None:
     assert int(last["end_ns"]) == T_INIT_NS
 
 
-def test_split_writes_a_folder_a_sensor(shell: Shell) -> None:
-    shell(f"convert {FIX} -o merged")
-    shell(f"convert {FIX} -o split --split")
-    assert names("split") == [
-        f"{sensor}/{index:06d}.npz" for sensor in ("left", "right") for index in range(7)
-    ]
-    whole = arrays("merged/000004.npz")
-    for number, sensor in enumerate(("left", "right")):
-        own = whole["lidar_id"] == number
-        part = arrays(f"split/{sensor}/000004.npz")
-        np.testing.assert_array_equal(part["xyz"], whole["xyz"][own])
-        np.testing.assert_array_equal(part["ring"], whole["ring"][own] - 32 * number)
-        assert (int(part["index"]), bool(part["complete"])) == (4, True)
-
-
-def test_checksums_are_checked_on_wish(shell: Shell, tmp_path: Path) -> None:
-    capture = write_session(tmp_path, Unit())
-    raw = bytearray(capture.read_bytes())
-    raw[24 + 40 * 1338 + 600] ^= 4  # one bit of a pixel in packet 40
-    capture.write_bytes(raw)
-    assert shell.dry(str(capture))["sensors"][0]["packets"]["rejected"] == {}
-    packets = shell.dry(f"{capture} --decode crc=check")["sensors"][0]["packets"]
-    assert packets["rejected"] == {"bad_crc": 1}
-    assert packets["lost"] == 1
-
-
 def test_host_clock_makes_uptime_clocks_comparable(shell: Shell, tmp_path: Path) -> None:
     one = Unit(begin_ns=50 * NS_PER_S, host_ns=EPOCH_NS)
     two = twin(replace(one, begin_ns=7000 * NS_PER_S, host_ns=EPOCH_NS - 6950 * NS_PER_S), 222)

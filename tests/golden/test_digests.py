@@ -1,21 +1,14 @@
 """Outputs of the command line against digests: bytes stay what they were.
 
-`digests.json` holds SHA-256 of every output file of small recordings, `wording.json` the texts in
-them, which digests leave out. Only the command line runs here, and only files are read, so that
-the test outlives every reorganisation of the package. One digest serves any number of jobs and
-all containers. To write the files again, after a change that is meant:
-
-    python -m tests.golden.test_digests --write
-    python -m tests.golden.test_digests --write-wording
-
-The first refuses where runs of one case differ from each other.
+`digests.json` holds SHA-256 of every output file of small recordings. Only the command line runs
+here, and only files are read, so that the test outlives every reorganisation of the package. One
+digest serves any number of jobs and all containers. After a change of outputs that is meant,
+`python -m tests.golden.test_digests` writes the file again, unless runs of one case differ.
 """
 
 from __future__ import annotations
 
-import argparse
 import contextlib
-import itertools
 import json
 import os
 import shutil
@@ -31,8 +24,6 @@ import pytest
 from tests.builders.run import command
 from tests.golden.digest_outputs import Digests
 from tests.golden.digest_recordings import (
-    CONTAINERS,
-    PAIRED,
     RECORDINGS,
     rig_of,
     write_recordings,
@@ -41,7 +32,6 @@ from tests.golden.digest_recordings import (
 _HERE = Path(__file__).resolve().parent
 _REPOSITORY = _HERE.parents[1]
 _DIGESTS = _HERE / "digests.json"
-_WORDING = _HERE / "wording.json"
 _SUFFIX = {"mcap": ".mcap", "rosbag1": ".bag"}
 
 
@@ -73,7 +63,7 @@ class Case:
         return "out" + _SUFFIX.get(self.format, "")
 
 
-# A cover of all pairs of values, as far as they go together (`test_rows_cover_all_pairs`).
+# A cover of all pairs of values, as far as they go together.
 # recording, format, layout, compression, container, jobs
 ROWS = """
 two_lidars mcap organized zstd bag 3
@@ -117,14 +107,6 @@ clouds ply dense none bag 1
 clouds rosbag1 organized none db3 1
 clouds rosbag2 dense zstd bag 3
 """
-_FACTORS: tuple[Sequence[str], ...] = (
-    PAIRED,
-    ("mcap", "npz", "ply", "rosbag1", "rosbag2"),
-    ("dense", "organized"),
-    ("none", "zstd"),
-    CONTAINERS,
-    ("1", "3"),
-)
 _PASSED = ("--pass", "/*/ouster/metadata")
 _THREE = Run(jobs=3)
 
@@ -247,17 +229,6 @@ QUERIES: Mapping[str, tuple[str, ...]] = {
     },
     "sensors": ("sensors",),
 }
-# Cases whose texts are kept: those with many kinds of notes and warnings.
-WORDED_CASES = (
-    *("two_lidars npz dense none", "four_makers mcap dense zstd", "livox npz dense none"),
-    *("clouds npz organized none", "two_lidars rosbag1 dense none", "four_makers ply dense none"),
-    *("align clocks", "decode crc", "many faults", "jump split", "stall", "drop incomplete"),
-    *("bag mcap", "bag rosbag1", "bag of ROS 1 mcap"),
-)
-WORDED_QUERIES = (
-    *("inspect two_lidars pcap", "inspect four_makers pcap", "inspect clouds mcap"),
-    *("inspect livox pcap", "inspect bag_mcap mcap", "compare two_lidars pcap", "sensors"),
-)
 
 
 @contextlib.contextmanager
@@ -299,8 +270,8 @@ main()
 """
 
 
-def convert(case: Case, run: Run, made: Path) -> str:
-    """Convert into the folder `made` of the working folder; gives what was printed to stderr."""
+def convert(case: Case, run: Run, made: Path) -> None:
+    """Convert into the folder `made` of the working folder."""
     words = words_of(case, run)
     kept: set[int] = set()
     if run.interrupt:
@@ -318,7 +289,6 @@ def convert(case: Case, run: Run, made: Path) -> str:
     assert said.code == 0, said.err
     if run.interrupt.startswith("open:"):
         assert kept & _numbers(made), "nothing of the first run was kept"
-    return said.err
 
 
 def _numbers(folder: Path) -> set[int]:
@@ -332,8 +302,7 @@ def digests_of(case: Case, run: Run) -> Digests:
     made = Path("made")
     shutil.rmtree(made, ignore_errors=True)
     made.mkdir()
-    for line in convert(case, run, made).splitlines():
-        found.texts.setdefault("stderr", set()).add(line)
+    convert(case, run, made)
     found.add_folder(made)
     if run == Run():
         for path in sorted(made.glob("out*")):
@@ -360,25 +329,13 @@ def digests_of_query(words: Sequence[str]) -> Digests:
     return found
 
 
-def entry_of(case: Case, run: Run, found: Digests) -> dict[str, dict[str, str]]:
-    """Digests as the file keeps them: the context of each container apart."""
-    return {"product": found.product, _context_key(case, run): found.context}
-
-
 def _context_key(case: Case, run: Run) -> str:
     return f"context {run.container or RECORDINGS[case.recording][0]}"
 
 
 def differences(expected: Mapping[str, str], found: Mapping[str, str]) -> list[str]:
     """Names of files whose digests differ, are missing or not expected."""
-    lines = [f"{name}: missing" for name in expected.keys() - found.keys()]
-    lines += [f"{name}: not expected" for name in found.keys() - expected.keys()]
-    lines += [
-        f"{name}: differs"
-        for name in expected.keys() & found.keys()
-        if expected[name] != found[name]
-    ]
-    return sorted(lines)
+    return sorted({name for name, _ in expected.items() ^ found.items()})
 
 
 def run_differences(
@@ -429,100 +386,30 @@ def test_queries_answer_what_they_did(
     assert not differences(kept[name]["context"], found.context), name
 
 
-def test_wording_is_what_it_was(workplace: Path) -> None:
-    """Texts may change: then read the new ones and write the file again."""
-    with inside(workplace):
-        found = wording()
-    expected = json.loads(_WORDING.read_text("utf-8"))
-    lines = _lines(found), _lines(expected)
-    assert (sorted(lines[0] - lines[1]), sorted(lines[1] - lines[0])) == ([], []), "(new, gone)"
-
-
-def test_rows_cover_all_pairs() -> None:
-    rows = [tuple(row.split()) for row in ROWS.split("\n")[1:-1]]
-    for first, second in itertools.combinations(range(len(_FACTORS)), 2):
-        found = {(row[first], row[second]) for row in rows}
-        for pair in itertools.product(_FACTORS[first], _FACTORS[second]):
-            one = dict(zip((first, second), pair, strict=True))
-            if _can_be(one):
-                assert pair in found
-
-
-def _can_be(one: Mapping[int, str]) -> bool:
-    """Whether values of some factors, by their numbers, go together."""
-    if one.get(1) == "ply" and one.get(2) == "organized":
-        return False
-    if one.get(3) == "zstd" and one.get(1, "mcap") not in ("mcap", "rosbag2"):
-        return False
-    return one.get(4, "") in ("", *RECORDINGS[one.get(0, "two_lidars")])
-
-
 def test_all_that_is_kept_is_tested(kept: dict[str, dict[str, dict[str, str]]]) -> None:
     assert kept.keys() == CASES.keys() | QUERIES.keys()
 
 
-def wording() -> dict[str, list[str]]:
-    """Texts of the worded cases and queries, by command and keys."""
-    texts: dict[str, set[str]] = {}
-    for name in WORDED_CASES:
-        _join(texts, digests_of(CASES[name], Run()))
-    for name in WORDED_QUERIES:
-        _join(texts, digests_of_query(QUERIES[name]), QUERIES[name][0])
-    return {key: sorted(texts[key]) for key in sorted(texts)}
-
-
-def _lines(texts: Mapping[str, Sequence[str]]) -> set[str]:
-    return {f"{key}: {line}" for key, lines in texts.items() for line in lines}
-
-
-def _join(texts: dict[str, set[str]], found: Digests, command_name: str = "") -> None:
-    for key, lines in found.texts.items():
-        # Outputs are called out or out.*, a report inside of one is as that next to it.
-        if key.startswith("verify "):
-            key = "verify " + key.split(" ", 2)[2]
-        elif "report" in key:
-            key = "report " + key.split(" ")[-1]
-        texts.setdefault(f"{command_name} {key}".strip(), set()).update(lines)
-
-
-def _write() -> int:
-    """Write `digests.json`; gives the number of runs that differ from their baseline."""
+def _main() -> None:
+    """Write `digests.json`, unless runs of one case differ."""
     entries: dict[str, dict[str, dict[str, str]]] = {}
-    wrong = 0
     for name, case in CASES.items():
         found = digests_of(case, Run())
-        entry = entry_of(case, Run(), found)
+        entry = {"product": found.product, _context_key(case, Run()): found.context}
         entry["about"] = {"baseline": found.about}
         for run in case.runs:
             other = digests_of(case, run)
             entry.setdefault(_context_key(case, run), other.context)
-            for line in run_differences(case, run, other, entry):
-                print(f"{name}: {run}: {line}")
-                wrong += 1
+            if lines := run_differences(case, run, other, entry):
+                raise SystemExit(f"{name}: {run}: {lines}; digests.json is as it was")
         entries[name] = entry
     for name, words in QUERIES.items():
         entries[name] = {"context": digests_of_query(words).context}
-    if not wrong:
-        _write_json(_DIGESTS, entries)
-    return wrong
-
-
-def _write_json(path: Path, document: object) -> None:
-    path.write_text(json.dumps(document, indent=1, ensure_ascii=False) + "\n", "utf-8")
-
-
-def _main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--write", action="store_true", help="write digests.json")
-    parser.add_argument("--write-wording", action="store_true", help="write wording.json")
-    given = parser.parse_args()
-    with tempfile.TemporaryDirectory() as folder, inside(Path(folder)):
-        write_recordings(Path("in"))
-        if given.write and _write():
-            raise SystemExit("runs of one case differ; digests.json is as it was")
-        if given.write_wording:
-            _write_json(_WORDING, wording())
+    text = json.dumps(entries, indent=1, ensure_ascii=False) + "\n"
+    _DIGESTS.write_text(text, "utf-8")
 
 
 if __name__ == "__main__":
-    _main()
+    with tempfile.TemporaryDirectory() as place, inside(Path(place)):
+        write_recordings(Path("in"))
+        _main()

@@ -339,59 +339,6 @@ def test_a_page_is_replaced_only_with_overwrite_and_nothing_else_ever(shell: She
     assert Path("thesis.html").read_text(encoding="utf-8").endswith("mine")
 
 
-MISTAKES = (
-    ("report nothing.json", 1, "expected a report or an output, found no such file or folder"),
-    ("report other.json", 1, "expected a report of schema mlbatch.report/1, found 'none'"),
-    ("report damaged.json", 1, "expected a report in JSON, found"),
-    ("report empty", 1, "expected a report in or next to the output, found none"),
-    ("report good.json -o missing/page.html", 1, "expected a page in an existing folder"),
-    ("report good.json -o empty", 1, "expected a file for the page, found a folder"),
-    ("report empty --report nothing.json", 1, "expected a report, found no such file"),
-    # Before the run.
-    ("convert -o scans --html scans/page.html", 1, "expected a page outside the output"),
-    ("convert -o scans --html none/page.html", 1, "expected a page in an existing folder"),
-    *(
-        (f"convert -o s.mcap --html {page} --report run.json", 1, f"expected a page {where}")
-        for page, where in (
-            ("run.json", "apart from the output, its table and report"),
-            ("s.mcap.scans.csv", "apart from the output, its table and report"),
-            ("s.mcap", "outside the output"),
-        )
-    ),
-    ("convert -o scans --html-scans 3", 2, "expected a page for the scans, found none; add --html"),
-    *(
-        (f"convert -o scans --html page.html --html-scans={number}", 2, "a number of scans from 1")
-        for number in ("0", "-1", "many", "1.5", "\u0662")
-    ),
-)
-
-
-@pytest.mark.parametrize(("words", "code", "message"), MISTAKES)
-def test_mistakes_are_one_line(words: str, code: int, message: str, shell: Shell) -> None:
-    Path("other.json").write_text("{}", encoding="utf-8")
-    Path("damaged.json").write_text("{", encoding="utf-8")
-    Path("good.json").write_text(text(report(sensor("left"))), encoding="utf-8")
-    Path("empty").mkdir()
-    before = set(Path().rglob("*"))
-    outcome = shell(words.replace("convert", f"convert {FIX}"))
-    assert outcome.code == code
-    assert message in outcome.err
-    assert outcome.err.count("\n") == 1
-    assert set(Path().rglob("*")) == before
-
-
-def test_segments_have_numbered_pages(shell: Shell) -> None:
-    outcome = shell(
-        f"convert {FIX} -o scans.mcap --html page.html --quiet --on-jump split "
-        "--fault jump:*:100s@400ms"
-    )
-    assert outcome.code == 0, outcome.err
-    assert sorted(path.name for path in Path().glob("*.html")) == [
-        "page.seg1.html",
-        "page.seg2.html",
-    ]
-
-
 def test_a_damaged_output_leaves_a_page_that_says_so(shell: Shell) -> None:
     assert shell(f"convert {FIX} -o scans.mcap --quiet").code == 0
     data = bytearray(Path("scans.mcap").read_bytes())

@@ -275,24 +275,6 @@ def test_warnings_come_after_the_last_scan(tmp_path: Path) -> None:
     assert err.count("mlbatch: warning: cut_off: ") == 1
 
 
-@pytest.mark.parametrize(
-    ("words", "code", "expected"),
-    [
-        ("none.pcap", 1, "none.pcap"),
-        ("{output} --rate 20", 2, "--rate: expected with recordings alone, found the output"),
-        ("{capture} --rate 0", 2, "rate: expected"),
-        ("{capture} -r {rig} --port 99999", 2, "--port: expected a free port"),
-    ],
-)
-def test_mistakes(words: str, code: int, expected: str, tmp_path: Path) -> None:
-    output = convert(tmp_path, "s.mcap") if "{output}" in words else ""
-    words = words.format(output=output, capture=CAPTURE, rig=RIG)
-    done = run_mlbatch(["view", *words.split(), "--no-browser"], tmp_path)
-    assert done.returncode == code
-    assert expected in done.stderr
-    assert len(done.stderr.splitlines()) == 1
-
-
 @pytest.mark.skipif(CHROMIUM is None, reason=NO_CHROMIUM)
 def test_in_a_browser(tab: Browser) -> None:
     shown = "document.documentElement.dataset.shown"

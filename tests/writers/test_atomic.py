@@ -9,7 +9,7 @@ import pytest
 
 from mlbatch.errors import ExportError
 from mlbatch.writers import open_writer
-from mlbatch.writers.atomic import check_free_space, prepare, write_text
+from mlbatch.writers.atomic import check_free_space, prepare
 from mlbatch.writers.base import WriterOptions
 from tests.builders.scans import SUMMARY, dense_scan, run_info, run_job
 
@@ -96,24 +96,7 @@ def test_places_that_are_none_are_named(
         prepare(Path(target), overwrite=True, folder=True)
 
 
-def test_a_folder_without_permission_is_named(tmp_path: Path) -> None:
-    locked = tmp_path / "locked"
-    locked.mkdir(mode=0o500)
-    if os.access(locked, os.W_OK):
-        pytest.skip("this user may write everywhere")
-    with pytest.raises(ExportError, match="choose an output where you may write"):
-        prepare(locked / "out", overwrite=False, folder=True)
-
-
 def test_too_little_free_disk_is_refused(tmp_path: Path) -> None:
     check_free_space(tmp_path / "out", 1)
     with pytest.raises(ExportError, match="expected about 1000000000000 MB of free disk"):
         check_free_space(tmp_path / "out", 10**18)
-
-
-def test_texts_replace_older_ones_whole(tmp_path: Path) -> None:
-    path = tmp_path / "report.json"
-    write_text(path, "long text\n")
-    write_text(path, "µ\n")
-    assert path.read_bytes() == b"\xc2\xb5\n"
-    assert len(list(tmp_path.iterdir())) == 1

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import itertools
-import json
 import zlib
 from fractions import Fraction
 from pathlib import Path
@@ -127,20 +126,6 @@ def test_every_file_can_be_read_alone(shell: Shell) -> None:
             assert not list(reader.iter_attachments())
         assert metadata.name == "mlbatch.grid"
         assert metadata.metadata == grid | {"windows_per_file": "1"}
-
-
-def test_ros_reads_the_bag(shell: Shell) -> None:
-    """By the library `rosbags`: all messages of all files, from first to last time."""
-    words = f"convert {CAPTURE} --format rosbag2 --max-bag-duration 0.3 -o out -q"
-    assert shell(words).code == 0
-    messages = [message for path in _files(Path("out")) for message in _messages(path)]
-    with AnyReader([Path("out")]) as reader:
-        found = [(one.topic, log_ns, bytes(raw)) for one, log_ns, raw in reader.messages()]
-        assert reader.message_count == len(messages)
-        assert reader.start_time == min(log_ns for _, log_ns, _ in messages)
-        # The library gives the end of the last nanosecond.
-        assert reader.end_time == max(log_ns for _, log_ns, _ in messages) + 1
-    assert sorted(found) == sorted(messages)
 
 
 @pytest.mark.parametrize(
@@ -286,48 +271,3 @@ def test_complete_files_are_noted_at_once(tmp_path: Path) -> None:
 
 
 # -- what is refused ----------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    ("options", "words"),
-    [
-        ("-o out.mcap --max-bag-duration 5", "expected --format rosbag2, a folder of several"),
-        ("-o out --max-bag-duration 5", "found npz"),
-        (
-            "-o out --format rosbag2 --max-bag-duration=-1",
-            "expected a number from 0 to 8589934592, found -1",
-        ),
-        ("-o out --format rosbag2 --max-bag-duration nan", "from 0 to 8589934592, found nan"),
-        ("-o out --format rosbag2 --max-bag-duration inf", "from 0 to 8589934592, found inf"),
-        ("-o out --format rosbag2 --shard 1/2", "expected --max-bag-duration for rosbag2"),
-    ],
-)
-def test_what_has_no_meaning_is_refused(shell: Shell, options: str, words: str) -> None:
-    outcome = shell(f"convert {CAPTURE} {options}")
-    assert outcome.code == 2
-    assert words in outcome.err
-    assert outcome.err.count("\n") == 1
-    assert not list(Path().iterdir())
-
-
-def test_a_lost_file_is_found(shell: Shell) -> None:
-    words = f"convert {CAPTURE} --format rosbag2 --max-bag-duration 0.3 -o out -q"
-    assert shell(words).code == 0
-    Path("out/out_1.mcap").unlink()
-    outcome = shell("verify out --json")
-    assert outcome.code == 1
-    violations = [one["where"] for one in json.loads(outcome.out)["violations"]]
-    assert "metadata.yaml relative_file_paths" in violations
-    assert shell("digest out").code == 1
-
-
-@pytest.mark.parametrize("command", ["verify", "digest"])
-def test_one_file_is_not_taken_for_the_output(shell: Shell, command: str) -> None:
-    words = f"convert {CAPTURE} --format rosbag2 --max-bag-duration 0.3 -o out -q"
-    assert shell(words).code == 0
-    outcome = shell(f"{command} out/out_1.mcap")
-    assert outcome.code == 1
-    assert outcome.err == (
-        "mlbatch: error: out/out_1.mcap: expected a whole output, found one of the files of a bag; "
-        "name its folder\n"
-    )

@@ -11,8 +11,8 @@ from pathlib import Path
 import pytest
 
 from mlbatch.errors import ExportError, UsageError
-from mlbatch.types import IMU, Scan
-from mlbatch.writers import check_target, direct_writes, extras, open_writer, output_file, plugin
+from mlbatch.types import Scan
+from mlbatch.writers import check_target, direct_writes, open_writer, output_file, plugin
 from mlbatch.writers.base import WriterOptions
 from mlbatch.writers.formats import format_names
 from tests.builders.scans import (
@@ -27,7 +27,6 @@ from tests.builders.scans import (
 ROOT = Path(__file__).resolve().parents[2]
 # The name of an output of each format.
 OUTPUTS = {name: f"out{plugin(name).SUFFIX or ''}" for name in format_names()}
-CONTAINERS = [name for name in OUTPUTS if IMU in extras(name, WriterOptions())]
 each_format = pytest.mark.parametrize("name", format_names())
 
 # Writes scans until something stops it; prints "ready" after some of them.
@@ -82,11 +81,6 @@ def whole(name: str, folder: Path, scans: list[Scan]) -> dict[str, bytes]:
     run_job(writer.flush())
     writer.finish(SUMMARY)
     return files(folder)
-
-
-@each_format
-def test_a_plug_in_has_the_name_of_its_format(name: str) -> None:
-    assert name == plugin(name).FORMAT
 
 
 @each_format
@@ -229,30 +223,3 @@ def test_an_output_that_another_run_writes_is_refused(name: str, tmp_path: Path)
     overwrite = WriterOptions(overwrite=True)
     open_writer(name, target, run_info(), overwrite).abandon()
     open_writer(name, target, run_info(), overwrite).finish(SUMMARY)
-
-
-@each_format
-def test_scans_are_read_during_the_stages_only(name: str, tmp_path: Path) -> None:
-    expected = whole(name, tmp_path / "a", [dense_scan()])
-    (tmp_path / "b").mkdir()
-    writer = open_writer(name, tmp_path / "b" / OUTPUTS[name], run_info(), WriterOptions())
-    scan = dense_scan()
-    writer.write_imu(imu_samples(0, scan.start_ns))
-    run_job(writer.write(scan))
-    scan.intensity[:] = -1
-    writer.finish(SUMMARY)
-    assert files(tmp_path / "b") == expected
-
-
-@pytest.mark.parametrize("name", sorted({*OUTPUTS} - {*CONTAINERS}))
-def test_point_layouts_are_for_messages(name: str, tmp_path: Path) -> None:
-    with pytest.raises(UsageError, match="point-layout"):
-        open_writer(name, tmp_path / "out", run_info(), WriterOptions("velodyne"))
-    assert not list(tmp_path.iterdir())
-
-
-@pytest.mark.parametrize("name", CONTAINERS)
-def test_unknown_point_layouts_name_the_known(name: str, tmp_path: Path) -> None:
-    with pytest.raises(UsageError, match="standard, velodyne, ouster"):
-        open_writer(name, tmp_path / OUTPUTS[name], run_info(), WriterOptions("velodine"))
-    assert not list(tmp_path.iterdir())

@@ -12,13 +12,8 @@ import pytest
 
 from mlbatch.errors import UsageError
 from mlbatch.writers import (
-    check_compression,
-    check_options,
     check_target,
     choose_format,
-    extras,
-    plugin,
-    report_paths,
     threads,
 )
 from mlbatch.writers.base import WriterOptions
@@ -89,55 +84,6 @@ def test_refusals_name_a_remedy(target: str, asked: str | None, hint: str) -> No
     assert "\n" not in str(caught.value)
 
 
-def test_paths_of_side_files() -> None:
-    folder = report_paths(Path("a/out"), "npz")
-    assert (folder.report, folder.scans_csv) == (Path("a/out/report.json"), Path("a/out/scans.csv"))
-    file = report_paths(Path("a/x.mcap"), "mcap")
-    assert file.report == Path("a/x.mcap.report.json")
-    assert file.scans_csv == Path("a/x.mcap.scans.csv")
-
-
-def test_contents_of_the_formats() -> None:
-    for name, encodings in (("mcap", {"cdr", "ros1"}), ("rosbag1", {"ros1"}), ("rosbag2", {"cdr"})):
-        assert extras(name, WriterOptions()) == {"imu", *encodings}
-        assert extras(name, WriterOptions("ouster")) == {
-            *("imu", "range_m", "reflectivity", *encodings)
-        }
-    for name in ("npz", "webdataset", "ply", "pcd", "las", "laz", "kitti", "nuscenes"):
-        assert not extras(name, WriterOptions()) & {"imu", "cdr", "ros1"}
-
-
-@pytest.mark.parametrize("name", ["npz", "ply", "rosbag1"])
-def test_formats_without_compression_refuse_it(name: str) -> None:
-    check_compression(name, WriterOptions())
-    with pytest.raises(UsageError) as caught:
-        check_compression(name, WriterOptions(compression="zstd"))
-    assert str(caught.value) == (
-        f"--compression: expected none for {name}, found 'zstd'; leave it out, or write a .mcap "
-        "or rosbag2 output"
-    )
-    with pytest.raises(UsageError, match="zstd:1 to zstd:22, found 'gzip'"):
-        check_compression(name, WriterOptions(compression="gzip"))
-
-
-@pytest.mark.parametrize("name", ["ply", "las", "laz", "kitti", "nuscenes"])
-def test_formats_that_are_never_organized(name: str, tmp_path: Path) -> None:
-    with pytest.raises(UsageError, match=f"expected dense for {name}, found organized"):
-        check_target(name, tmp_path / "x", WriterOptions(), "organized")
-    assert not list(tmp_path.iterdir())
-
-
-def test_styles_are_those_of_ply() -> None:
-    check_options("ply", WriterOptions(ply_style="float"))
-    with pytest.raises(UsageError, match="expected standard, cloudcompare, float, found 'pdal'"):
-        check_options("ply", WriterOptions(ply_style="pdal"))
-    with pytest.raises(UsageError) as caught:
-        check_options("npz", WriterOptions(ply_style="float"))
-    assert str(caught.value) == (
-        "--ply-style: expected standard for npz, found 'float'; leave it out, or give --format ply"
-    )
-
-
 def test_a_missing_package_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with contextlib.suppress(ImportError):
         # laspy looks for lazrs once, when it is imported: later tests need what it finds.
@@ -157,11 +103,6 @@ def test_a_missing_package_is_one_line(tmp_path: Path, monkeypatch: pytest.Monke
 
 FAST = WriterOptions("standard", False, False)
 SLOW = WriterOptions("standard", False, False, compression="zstd")
-
-
-@pytest.mark.parametrize(("text", "jobs"), [("1", 1), ("64", 64), ("007", 7), ("auto", None)])
-def test_jobs_as_written(text: str, jobs: int | None) -> None:
-    assert parse_jobs("--jobs", text) == jobs
 
 
 @pytest.mark.parametrize("text", ["0", "65", "-1", "1.0", "", "Auto", "\u0663", "9" * 5000])
@@ -188,9 +129,3 @@ def test_several_jobs_where_writing_is_slow(
     monkeypatch.setattr(threads, "_cores", lambda: cores)
     assert jobs_for(None, name, options) == jobs
     assert jobs_for(5, name, options) == 5
-
-
-def test_a_format_may_be_slow(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(threads, "_cores", lambda: 64)
-    monkeypatch.setattr(plugin("npz"), "IS_SLOW", True, raising=False)
-    assert jobs_for(None, "npz", FAST) == 4

@@ -15,13 +15,9 @@ from hypothesis import strategies as st
 from mlbatch.writers import direct_writes, output_file
 from mlbatch.writers.direct_writes import BLOCK_BYTES, DirectWrites
 from mlbatch.writers.output_file import (
-    Bytes,
     OutputFile,
-    WriteBehind,
     file_crc,
     joined_crc,
-    take_scratch,
-    write_all,
     write_summed,
 )
 
@@ -101,21 +97,6 @@ def test_bytes_of_a_refused_write_go_through_the_cache(
     assert not direct.is_direct
 
 
-def test_a_full_disk_is_an_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def full(descriptor: int, data: bytes, position: int) -> int:
-        raise OSError(errno.ENOSPC, "full")
-
-    path = tmp_path / "file"
-    path.write_bytes(b"")
-    descriptor = os.open(path, os.O_RDWR)
-    direct = DirectWrites(descriptor, 0)
-    monkeypatch.setattr(os, "pwrite", full)
-    with pytest.raises(OSError, match="full"):
-        direct.put(content(STAGE_BYTES, 1))
-    os.close(descriptor)
-    assert path.read_bytes() == b""
-
-
 def test_large_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(output_file, "_DROP_BYTES", 3 * BLOCK_BYTES)
     parts = [content(length, length) for length in (5000, 1, 9000, 40_000, 0, 3, 70_001)]
@@ -130,15 +111,6 @@ def test_large_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 # -- gathered writes, checksums, scratch ----------------------------------------------------------
-
-
-def test_parts_are_written_one_after_the_other(tmp_path: Path) -> None:
-    """More parts than a system takes at once, empty ones, and any kind of bytes."""
-    parts: list[Bytes] = [bytes([number % 251]) * (number % 7) for number in range(3000)]
-    parts += [bytearray(b"abc"), memoryview(bytes(100_000)), b""]
-    with io.FileIO(tmp_path / "file", "w") as file:
-        write_all(file, parts)
-    assert (tmp_path / "file").read_bytes() == b"".join(parts)
 
 
 def test_written_bytes_are_summed(tmp_path: Path) -> None:
@@ -158,16 +130,3 @@ def test_a_joined_checksum_is_that_of_all_bytes(first: bytes, size: int, value: 
     second = bytes([value]) * size
     joined = joined_crc(zlib.crc32(first), zlib.crc32(second), size)
     assert joined == zlib.crc32(first + second)
-
-
-def test_scratch_is_reused() -> None:
-    idle = [["first"]]
-    taken = take_scratch(idle, list)
-    assert (taken, idle) == (["first"], [])
-    assert take_scratch(idle, list) == []
-
-
-def test_files_that_are_gone_need_no_dropping(tmp_path: Path) -> None:
-    behind = WriteBehind()
-    for number in range(3):
-        behind.add(tmp_path / f"{number}", 50 << 20)

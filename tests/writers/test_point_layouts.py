@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from mlbatch.decode.scan_buffer import ScanBuffer
-from mlbatch.types import RecordLayout, RecordPiece, Scan
+from mlbatch.types import Scan
 from mlbatch.writers.point_layouts import (
     CLOUD_LAYOUTS,
     PLY_LAYOUTS,
@@ -130,35 +130,3 @@ def test_arrays_are_packed_wherever_they_are(kind: str, name: str, begin: int) -
     assert len(set(found)) == 1
     if name != "autoware":
         check_records(found[0][begin:], scan, name, seed=begin)
-
-
-def test_no_points() -> None:
-    assert len(packed(side_by_side(dense_scan(points=0, columns=1)), "standard")) == 0
-
-
-def test_pieces_of_records() -> None:
-    """Fields that are side by side in the arrays of a decoder are one piece."""
-    point = RecordPiece("point", 0, 0, 16)
-    assert LAYOUTS["standard"].record == RecordLayout(
-        24, (point, RecordPiece("seconds_f4", 16, 0, 4), RecordPiece("label", 20, 4, 4))
-    )
-    assert LAYOUTS["minimal"].record == RecordLayout(12, (RecordPiece("point", 0, 0, 12),))
-    # Angles are computed by numpy.
-    assert LAYOUTS["autoware"].record is None
-
-
-@pytest.mark.parametrize("name", LAYOUTS)
-def test_pieces_are_in_the_record_once(name: str) -> None:
-    layout = LAYOUTS[name]
-    if layout.record is None:
-        return
-    used = [at for one in layout.record.pieces for at in range(one.offset, one.offset + one.bytes)]
-    assert len(used) == len(set(used))
-    assert layout.record.step == layout.step
-    fields = {
-        at
-        for field in layout.fields
-        if field.name != "ambient"  # always 0
-        for at in range(field.offset, field.offset + np.dtype(field.dtype).itemsize)
-    }
-    assert set(used) == fields

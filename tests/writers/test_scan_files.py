@@ -10,7 +10,6 @@ import json
 import math
 import struct
 import tarfile
-import zipfile
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from datetime import date
@@ -353,16 +352,6 @@ def test_every_key_of_npz_comes_back_as_it_was(tmp_path: Path) -> None:
     assert loaded["xyz"].flags.c_contiguous
     assert loaded["slices"] == 1
     assert {key: str(loaded[key]) for key in set(loaded) - {*TYPES}} == WORDS
-
-
-def test_the_zip_of_npz_is_that_of_zipfile(tmp_path: Path) -> None:
-    path = written(tmp_path / "out", "npz", dense_scan()) / "000000.npz"
-    again = io.BytesIO()
-    with zipfile.ZipFile(path) as found, zipfile.ZipFile(again, "w") as expected:
-        assert found.testzip() is None
-        for name in found.namelist():
-            expected.writestr(zipfile.ZipInfo(name), found.read(name))
-    assert path.read_bytes() == again.getvalue()
 
 
 # -- webdataset -----------------------------------------------------------------------------------
