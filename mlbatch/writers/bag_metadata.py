@@ -8,12 +8,9 @@ from __future__ import annotations
 import json
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 from mlbatch.errors import ExportError
-
-if TYPE_CHECKING:
-    from mlbatch.writers.mcap_container import McapContainer
 
 METADATA = "metadata.yaml"
 
@@ -40,21 +37,6 @@ class BagFile(NamedTuple):
     def messages(self) -> int:
         """Number of messages."""
         return sum(topic.messages for topic in self.topics)
-
-
-def file_of_container(container: McapContainer, name: str) -> BagFile:
-    """Describe a file that was just completed."""
-    topics = (
-        BagTopic(
-            channel.topic,
-            schema,
-            channel.message_encoding,
-            channel.metadata["offered_qos_profiles"],
-            sent,
-        )
-        for channel, schema, sent in container.contents()
-    )
-    return BagFile(name, *container.span_ns, tuple(topics))
 
 
 def read_file(path: Path) -> BagFile:
@@ -84,7 +66,7 @@ def _file_of_summary(path: Path) -> BagFile:
             channel.metadata["offered_qos_profiles"],
             statistics.channel_message_counts.get(number, 0),
         )
-        for number, channel in sorted(summary.channels.items())
+        for number, channel in summary.channels.items()
     )
     first_ns, last_ns = statistics.message_start_time, statistics.message_end_time
     return BagFile(path.name, first_ns, last_ns, tuple(topics))

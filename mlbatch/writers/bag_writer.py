@@ -1,22 +1,23 @@
-"""A ROS 2 bag of several MCAP files, each with the scans of so many windows (`--max-bag-duration`).
+"""A ROS 2 bag: one MCAP file, or several, each with the scans of so many windows.
 
-Every file can be read alone: it begins with /tf_static and has `mlbatch.grid`. The report and
-scans.csv are of the whole run, and so in the folder only. A file depends on no other: several runs
-may make different ones.
+Each of several (`--max-bag-duration`) can be read alone: it begins with /tf_static and has
+`mlbatch.grid`. The report and scans.csv are of the whole run, and so in the folder only; the only
+file of a bag has them inside. A file depends on no other: several runs may make different ones.
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from fractions import Fraction
 from pathlib import Path
 from typing import NamedTuple
 
+from mlbatch.errors import ExportError
 from mlbatch.ros.encoding import Wire
 from mlbatch.types import Message, RunInfo, Scan, Summary, Topic
 from mlbatch.writers.bag_metadata import METADATA, metadata_text, read_file
-from mlbatch.writers.base import FileSet, ScanJob, WriterOptions, windows_per_file
+from mlbatch.writers.base import ScanJob, WriterOptions, windows_per_file
 from mlbatch.writers.mcap_container import McapContainer
 from mlbatch.writers.message_writer import (
     TF_STATIC,
@@ -25,6 +26,7 @@ from mlbatch.writers.message_writer import (
     MessageFile,
     MessageWriter,
     PendingChunk,
+    grid_of,
     stamp_ns,
     static_transforms,
 )
@@ -50,40 +52,14 @@ def write_metadata(folder: Path, stem: str, numbers: Sequence[int]) -> None:
 
 
 class BagWriter(MessageWriter):
-    """Writes a run as messages in several files; see `MessageWriter`."""
+    """Writes a run as messages in one file or several; see `MessageWriter`."""
 
-    def __init__(
-        self,
-        target: Path,
-        info: RunInfo,
-        options: WriterOptions,
-        check_topic: Callable[[Topic], None],
-    ) -> None:
-        """check_topic: called with each forwarded topic, raises ExportError to refuse it."""
-        windows = windows_per_file(options.max_bag_s, Fraction(info.rate_hz))
-
-        def new_file(path: Path) -> McapContainer:
-            return McapContainer(path, options.compression, check_topic)
-
-        def begin_file(container: McapContainer, log_ns: int) -> None:
-            transforms = static_transforms(info, log_ns, Wire)
-            container.send(TF_STATIC, TF_TYPE, log_ns, transforms, latched=True)
-
-        def end_file(container: McapContainer) -> int:
-            # By this readers know that report and table are not in the file.
-            grid = self._grid(info.t_init_ns) | {"windows_per_file": str(windows)}
-            return container.finish_piece(grid)
-
+    def __init__(self, target: Path, info: RunInfo, options: WriterOptions) -> None:
         def open_files(folder: Path) -> MessageFile:
-            stages = FileStages(new_file, begin_file, end_file)
-            self._bag = BagFiles(folder, target.name, windows, stages, options.files)
+            self._bag = BagFiles(folder, target.name, info, options)
             return self._bag
 
         super().__init__(target, info, options, Wire, open_files, folder=True)
-
-    def skip(self, scan: Scan, sensor: int | None = None) -> ScanJob:
-        """Return the job of a scan in a file of another run: it has a place, and no message."""
-        return _SkippedJob(self, scan)
 
     def begin_file(self, log_ns: int) -> None:
         """Begin the file of the window, if no message has begun it; log_ns: of the first one."""
@@ -94,26 +70,37 @@ class BagWriter(MessageWriter):
         self._bag.start(index)
 
 
-class FileStages(NamedTuple):
-    """Actions on each file."""
+class BagPartsWriter(BagWriter):
+    """Writes a run in several files, some of which may be those of other runs."""
 
-    new: Callable[[Path], McapContainer]
-    begin: Callable[[McapContainer, int], None]  # writes the first messages, at a log time
-    end: Callable[[McapContainer], int]  # completes it; gives its CRC-32
+    def skip(self, scan: Scan, sensor: int | None = None) -> ScanJob:
+        """Return the job of a scan in a file of another run: it has a place, and no message."""
+        return _SkippedJob(self, scan)
+
+
+def check_topic(topic: Topic) -> None:
+    """Refuse messages of ROS 1: a player of ROS 2 bags cannot read them."""
+    if topic.encoding != "cdr":
+        raise ExportError(
+            f"{topic.name}: expected messages of ROS 2 (cdr) for a ROS 2 bag, found "
+            f"{topic.encoding!r}; do not pass the topic, or write a .mcap, which takes both"
+        )
 
 
 class BagFiles:
     """The files of a bag, one after the other; see `message_writer.MessageFile`."""
 
-    def __init__(
-        self, folder: Path, stem: str, windows: int, stages: FileStages, files: FileSet | None
-    ) -> None:
-        """stem: what the names of files begin with; windows: in a file."""
+    def __init__(self, folder: Path, stem: str, info: RunInfo, options: WriterOptions) -> None:
+        """stem: what the names of files begin with."""
         self._folder = folder
         self._stem = stem
-        self._windows = windows
-        self._stages = stages
-        self._files = files
+        self._info = info
+        self._compression = options.compression
+        self._files = options.files
+        # In a file; 0: all are in one.
+        self._windows = 0
+        if options.max_bag_s:
+            self._windows = windows_per_file(options.max_bag_s, Fraction(info.rate_hz))
         self._number = -1  # of the last file that was begun, here or by another run
         self._block = 0  # windows [block * windows, (block + 1) * windows)
         self._is_begun = False  # the block has a file
@@ -123,7 +110,7 @@ class BagFiles:
 
     def start(self, index: int) -> None:
         """Continue with the file of a window; call in the order of the scans."""
-        block = max(index, 0) // self._windows
+        block = max(index, 0) // self._windows if self._windows else 0
         if block != self._block:
             self._end_file()
             self._block = block
@@ -162,10 +149,13 @@ class BagFiles:
 
     def finish(self, summary: Summary, grid: dict[str, str]) -> None:
         """Complete the last file, and describe all that are here in metadata.yaml."""
-        self._end_file()
-        for chunk in self.take_chunks():
-            chunk.compress()
-            chunk.write()
+        if self._windows:
+            self._end_file()
+            for chunk in self.take_chunks():
+                chunk.compress()
+                chunk.write()
+        elif self._container is not None:
+            self._container.finish(summary, grid)
         paths = map(self._path, range(self._number + 1))
         numbers = [number for number, path in enumerate(paths) if path.exists()]
         if numbers:
@@ -178,7 +168,9 @@ class BagFiles:
 
     def complete(self, number: int, block: int, container: McapContainer) -> None:
         """Complete a file once its chunks are written."""
-        crc = self._stages.end(container)
+        # By this readers know that report and table are not in the file.
+        pieces = {"windows_per_file": str(self._windows)}
+        crc = container.finish_piece(grid_of(self._info, self._info.t_init_ns) | pieces)
         self._unfinished.remove(container)
         if self._files is not None:
             self._files.made({self._path(number).name: crc}, block * self._windows)
@@ -192,11 +184,13 @@ class BagFiles:
             self._is_begun = True
             self._number += 1
             if self._files is None or self._files.is_due(self._block * self._windows):
-                self._container = self._stages.new(self._path(self._number))
+                path = self._path(self._number)
+                self._container = McapContainer(path, self._compression, check_topic)
                 self._unfinished.append(self._container)
                 # The writer itself begins the first one.
                 if self._number:
-                    self._stages.begin(self._container, log_ns)
+                    transforms = static_transforms(self._info, log_ns, Wire)
+                    self._container.send(TF_STATIC, TF_TYPE, log_ns, transforms, latched=True)
         return self._container
 
     def _end_file(self) -> None:
@@ -210,21 +204,20 @@ class BagFiles:
         self._is_begun = False
 
 
-class _FileEnd:
+class _FileEnd(NamedTuple):
     """Completes a file after its chunks; see `message_writer.PendingChunk`."""
 
-    def __init__(self, bag: BagFiles, number: int, block: int, container: McapContainer) -> None:
-        self._bag = bag
-        self._number = number
-        self._block = block
-        self._container = container
+    bag: BagFiles
+    number: int
+    block: int
+    container: McapContainer
 
     def compress(self) -> None:
         """Do nothing."""
 
     def write(self) -> None:
         """Complete the file."""
-        self._bag.complete(self._number, self._block, self._container)
+        self.bag.complete(self.number, self.block, self.container)
 
 
 class _SkippedJob(ChunkJob):

@@ -124,19 +124,16 @@ class McapContainer:
         path: Path,
         compression: str = NO_COMPRESSION,
         check_topic: Callable[[Topic], None] | None = None,
-        on_finish: Callable[[McapContainer], None] | None = None,
         library: str = f"mlbatch {mlbatch.__version__}",
     ) -> None:
         """Create a file.
 
         compression: as in `--compression`; check_topic: called with each forwarded topic, raises
-        ExportError to refuse it; on_finish: called once the file is complete and closed; library:
-        in the header, by which outputs of `convert` are known.
+        ExportError to refuse it; library: in the header, by which outputs of `convert` are known.
         """
         self._file = OutputFile(path)
         self._compression, self._new_compress = compression_of(compression)
         self._check_topic = check_topic
-        self._on_finish = on_finish
         self._idle: list[Compress] = []
         self._schemas: dict[tuple[str, str, str], Schema] = {}
         self._channels: dict[str, Channel] = {}  # by topic, our own
@@ -334,22 +331,10 @@ class McapContainer:
     def _complete(self) -> None:
         self._write_summary()
         self._file.complete()
-        if self._on_finish is not None:
-            self._on_finish(self)
 
     def abandon(self) -> None:
         """Close the incomplete file."""
         self._file.close()
-
-    def contents(self) -> list[tuple[Channel, str, int]]:
-        """Return every channel with the name of its schema and the number of its messages."""
-        names = {schema.id: schema.name for schema in self._schemas.values()}
-        return [(c, names[c.schema_id], self._sent.get(c.id, 0)) for c in self._all_channels()]
-
-    @property
-    def span_ns(self) -> tuple[int, int]:
-        """First and last log time of the written chunks."""
-        return self._span_ns
 
     def _all_channels(self) -> tuple[Channel, ...]:
         return (*self._channels.values(), *self._forwarded.values())

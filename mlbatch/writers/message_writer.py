@@ -191,7 +191,7 @@ class MessageWriter:
         output = self._output
         with self.errors():
             self._begin(summary.t_init_ns)
-            self.file.finish(summary, self._grid(summary.t_init_ns))
+            self.file.finish(summary, grid_of(self._info, summary.t_init_ns))
         output.sync()
         if last is not None:
             last(output.partial)
@@ -280,18 +280,19 @@ class MessageWriter:
         for stamp_ns, message in zip(item.stamp_ns.tolist(), messages, strict=True):
             self.file.send(topic, "sensor_msgs/Imu", stamp_ns, message)
 
-    def _grid(self, t_init_ns: int | None) -> dict[str, str]:
-        info = self._info
-        return {
-            "rate_hz": info.rate_hz,
-            "t_init_ns": "" if t_init_ns is None else str(t_init_ns),
-            "slices": str(info.slices),
-            "sensors": json.dumps([sensor.name for sensor in info.sensors], ensure_ascii=False),
-            "timescale": info.timescale,
-            "frame_id": info.frame_id,
-            "sort": info.sort,
-            **dict(info.variants),
-        }
+
+def grid_of(info: RunInfo, t_init_ns: int | None) -> dict[str, str]:
+    """Return the metadata record `mlbatch.grid` of a run."""
+    return {
+        "rate_hz": info.rate_hz,
+        "t_init_ns": "" if t_init_ns is None else str(t_init_ns),
+        "slices": str(info.slices),
+        "sensors": json.dumps([sensor.name for sensor in info.sensors], ensure_ascii=False),
+        "timescale": info.timescale,
+        "frame_id": info.frame_id,
+        "sort": info.sort,
+        **dict(info.variants),
+    }
 
 
 def stamp_ns(scan: Scan) -> int:
