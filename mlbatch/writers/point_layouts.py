@@ -1,7 +1,6 @@
 """Layouts of point records as tables, and how records are filled (docs/sources/outputs.md).
 
-Fields are pieces of the compiled packer (`native/pack.c`); what only numpy computes is filled block
-by block, so that the strided writes of a block stay in the processor's cache.
+Fields are pieces of the compiled packer (`native/pack.c`), or computed by numpy.
 """
 
 from __future__ import annotations
@@ -13,7 +12,7 @@ from typing import NamedTuple, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
-from mlbatch.arrays import F32Array, F64Array, U8Array, U16Array
+from mlbatch.arrays import F32Array, F64Array, U16Array
 from mlbatch.decode.records import RecordPacker
 from mlbatch.errors import ExportError
 from mlbatch.types import (
@@ -23,52 +22,14 @@ from mlbatch.types import (
     RecordLayout,
     RecordPiece,
     Scan,
-    SensorInfo,
 )
 
 Values: TypeAlias = npt.NDArray[np.generic]
 Records: TypeAlias = npt.NDArray[np.void]
-# Kinds of pieces that are copies; the piece of a field that is always zero.
+# Kinds of pieces that are copies.
 _COPIES = ("point", "label", "reflectivity")
-_ZERO = ("", 0)
 
 
-class Points(NamedTuple):
-    """Arrays to copy into records, in the order of the file: (p,), or (slots, n) if organized."""
-
-    sensors: tuple[SensorInfo, ...]
-    xyz: F32Array
-    intensity: F32Array
-    reflectivity: U16Array | None
-    ring: U16Array
-    lidar_id: U8Array
-
-    def take(self, rows: slice) -> Points:
-        """Return the points in `rows` of the first axis."""
-        return Points(
-            self.sensors,
-            self.xyz[rows],
-            self.intensity[rows],
-            None if self.reflectivity is None else self.reflectivity[rows],
-            self.ring[rows],
-            self.lidar_id[rows],
-        )
-
-
-def _points_of(scan: Scan) -> Points:
-    """Return the points of a scan; organized ones are transposed to rows of slots."""
-    organized = scan.info.layout == "organized"
-    return Points(
-        scan.info.sensors,
-        scan.xyz.transpose(1, 0, 2) if organized else scan.xyz,
-        scan.intensity.T,
-        None if scan.reflectivity is None else scan.reflectivity.T,
-        scan.ring.T,
-        scan.lidar_id.T,
-    )
-
-
-_BLOCK_POINTS = 8192
 _MAX_U8 = 255
 
 
@@ -78,8 +39,8 @@ class Field(NamedTuple):
     name: str
     dtype: str  # little endian
     offset: int  # bytes
-    piece: tuple[str, int] = _ZERO  # kind and source of a `RecordPiece`
-    values: Callable[[Points], Values] | None = None  # of any type that converts to `dtype`
+    piece: tuple[str, int] = ("", 0)  # kind and source of a `RecordPiece`; "": it is 0
+    values: Callable[[Scan], Values] | None = None  # of any type that converts to `dtype`
 
     @property
     def size(self) -> int:
@@ -167,17 +128,9 @@ class Layout(NamedTuple):
             )
         packer = RecordPacker(self._record, has_reflectivity=scan.reflectivity is not None)
         packer.pack(scan, out.reshape(-1).view(np.uint8))
-        computed = [(field.name, field.values) for field in self.fields if field.values]
-        if not computed:
-            return
-        points = _points_of(scan)
-        rows, *rest = points.ring.shape
-        block_rows = max(1, _BLOCK_POINTS // max(1, math.prod(rest)))
-        for start in range(0, rows, block_rows):
-            rows_of_block = slice(start, start + block_rows)
-            block = points.take(rows_of_block)
-            for name, values in computed:
-                out[name][rows_of_block] = values(block)
+        for field in self.fields:
+            if field.values:
+                out[field.name] = field.values(scan).T
 
 
 class ScanRecords:
@@ -223,11 +176,11 @@ def _is_continued(first: RecordPiece, second: RecordPiece) -> bool:
     )
 
 
-def _in_sensor(points: Points) -> list[F64Array]:
+def _in_sensor(scan: Scan) -> list[F64Array]:
     """Return x, y and z, m, of every point in the frame of its sensor; poses are rigid."""
-    poses = np.stack([sensor.body_from_sensor for sensor in points.sensors])
-    sensor = points.lidar_id
-    offset = [points.xyz[..., axis] - poses[:, axis, 3][sensor] for axis in range(3)]
+    poses = np.stack([sensor.body_from_sensor for sensor in scan.info.sensors])
+    sensor = scan.lidar_id
+    offset = [scan.xyz[..., axis] - poses[:, axis, 3][sensor] for axis in range(3)]
     # The inverse of a rotation is its transpose: columns of the matrix are the sensor's axes.
     return [
         poses[:, 0, axis][sensor] * offset[0]
@@ -237,172 +190,154 @@ def _in_sensor(points: Points) -> list[F64Array]:
     ]
 
 
-def _azimuth(points: Points) -> Values:
+def _azimuth(scan: Scan) -> Values:
     """Return the azimuth, rad, from x to y."""
-    x, y, _ = _in_sensor(points)
+    x, y, _ = _in_sensor(scan)
     return np.arctan2(y, x)
 
 
-def _elevation(points: Points) -> Values:
+def _elevation(scan: Scan) -> Values:
     """Return the elevation, rad, upwards from the xy plane."""
-    x, y, z = _in_sensor(points)
+    x, y, z = _in_sensor(scan)
     angle: F64Array = np.arctan2(z, np.sqrt(x * x + y * y))
     return angle
 
 
-def _distance(points: Points) -> Values:
+def _distance(scan: Scan) -> Values:
     """Return the distance from the sensor's origin, m."""
-    x, y, z = _in_sensor(points)
+    x, y, z = _in_sensor(scan)
     return np.sqrt(x * x + y * y + z * z)
 
 
-def _channel(points: Points) -> Values:
-    bases = np.array([sensor.ring_base for sensor in points.sensors], dtype=np.uint16)
-    base = bases[points.lidar_id]
+def _channel(scan: Scan) -> Values:
+    bases = np.array([sensor.ring_base for sensor in scan.info.sensors], dtype=np.uint16)
+    base = bases[scan.lidar_id]
     # Empty slots of an organized scan have ring 0 for every sensor.
-    return np.where(points.ring < base, np.uint16(0), points.ring - base)
+    return np.where(scan.ring < base, np.uint16(0), scan.ring - base)
 
 
-def _byte_intensity(points: Points) -> F32Array | U16Array:
+def _byte_intensity(scan: Scan) -> F32Array | U16Array:
     """Return what 8-bit layouts store as intensity: reflectivity where a sensor has it.
 
     Reflectivity has the range of 8 bits; the signal of the same sensors exceeds it.
     """
-    if points.reflectivity is None:
-        return points.intensity
-    has_reflectivity = np.array([sensor.has_reflectivity for sensor in points.sensors])
+    if scan.reflectivity is None:
+        return scan.intensity
+    has_reflectivity = np.array([sensor.has_reflectivity for sensor in scan.info.sensors])
     if has_reflectivity.all():
-        return points.reflectivity
-    reflectivity = points.reflectivity.astype(np.float32)
-    return np.where(has_reflectivity[points.lidar_id], reflectivity, points.intensity)
+        return scan.reflectivity
+    reflectivity = scan.reflectivity.astype(np.float32)
+    return np.where(has_reflectivity[scan.lidar_id], reflectivity, scan.intensity)
 
 
-def _intensity_u8(points: Points) -> Values:
-    value: Values = np.clip(np.nan_to_num(_byte_intensity(points)), 0, _MAX_U8)
+def _intensity_u8(scan: Scan) -> Values:
+    value: Values = np.clip(np.nan_to_num(_byte_intensity(scan)), 0, _MAX_U8)
     return value
 
 
 def clipped_points(scan: Scan) -> list[int]:
     """Return the number of points, by sensor, whose intensity is outside the range of 8 bits."""
-    points = _points_of(scan)
-    intensity = _byte_intensity(points)
+    intensity = _byte_intensity(scan)
     # Empty slots of organized scans are NaN, which compares as False.
     outside = (intensity < 0) | (intensity > _MAX_U8)
-    counts: list[int] = np.bincount(
-        points.lidar_id[outside], minlength=len(points.sensors)
-    ).tolist()
+    owners = scan.lidar_id[outside]
+    counts: list[int] = np.bincount(owners, minlength=len(scan.info.sensors)).tolist()
     return counts
 
 
-_XYZ = (
-    Field("x", "<f4", 0, ("point", 0)),
-    Field("y", "<f4", 4, ("point", 4)),
-    Field("z", "<f4", 8, ("point", 8)),
-)
+# Values of fields; of no piece the writer fills in x, y and z, and all else is 0.
+_VALUES = {
+    value.name: value
+    for value in (
+        Field("x", "<f4", 0, ("point", 0)),
+        Field("y", "<f4", 0, ("point", 4)),
+        Field("z", "<f4", 0, ("point", 8)),
+        Field("intensity", "<f4", 0, ("point", 12)),
+        Field("time", "<f4", 0, ("seconds_f4", 0)),
+        Field("time_f8", "<f8", 0, ("seconds_f8", 0)),
+        Field("time_ns", "<u4", 0, ("label", 0)),
+        Field("stamp", "<f8", 0, ("stamp_f8", 0)),
+        Field("ring", "<u2", 0, ("label", 4)),
+        Field("ring_i4", "<i4", 0, ("ring_i4", 0)),
+        Field("ring_f4", "<f4", 0, ("ring_f4", 0)),
+        Field("return_type", "u1", 0, ("label", 6)),
+        Field("lidar_id", "u1", 0, ("label", 7)),
+        Field("lidar_f4", "<f4", 0, ("lidar_f4", 0)),
+        Field("reflectivity", "<u2", 0, ("reflectivity", 0)),
+        Field("range_mm", "<u4", 0, ("range_mm_u4", 0)),
+        Field("u2", "<u2", 0),
+        Field("f4", "<f4", 0),
+        Field("f8", "<f8", 0),
+        Field("intensity_u8", "u1", 0, values=_intensity_u8),
+        Field("channel", "<u2", 0, values=_channel),
+        Field("azimuth", "<f4", 0, values=_azimuth),
+        Field("elevation", "<f4", 0, values=_elevation),
+        Field("distance", "<f4", 0, values=_distance),
+    )
+}
 
 
-def _intensity(offset: int) -> Field:
-    return Field("intensity", "<f4", offset, ("point", 12))
+def _layout(name: str, text: str, extras: Sequence[str] = (), step: int = 0) -> Layout:
+    """Return a layout of fields `name=value@offset` that follow each other.
+
+    value: as above, where it is not the name; offset: after a gap; step: if bytes follow.
+    """
+    fields: list[Field] = []
+    end = 0
+    for word in text.split():
+        named, _, offset = word.partition("@")
+        field, _, value = named.partition("=")
+        begin = int(offset or end)
+        fields.append(_VALUES[value or field]._replace(name=field, offset=begin))
+        end = begin + fields[-1].size
+    return Layout(name, step or end, tuple(fields), frozenset(extras))
 
 
-def _ring(offset: int) -> Field:
-    return Field("ring", "<u2", offset, ("label", 4))
-
-
-def _time(offset: int) -> Field:
-    return Field("time", "<f4", offset, ("seconds_f4", 0))
-
-
-def _time_ns(name: str, offset: int) -> Field:
-    return Field(name, "<u4", offset, ("label", 0))
-
-
-def _return_type(offset: int) -> Field:
-    return Field("return_type", "u1", offset, ("label", 6))
-
-
-def _lidar_id(offset: int) -> Field:
-    return Field("lidar_id", "u1", offset, ("label", 7))
-
-
-_STANDARD = (*_XYZ, _intensity(12), _time(16), _ring(20), _return_type(22), _lidar_id(23))
-_VELODYNE = (*_XYZ, _intensity(12), _ring(16), _time(18))
-_OUSTER = (
-    *_XYZ,
-    _intensity(16),
-    _time_ns("t", 20),
-    Field("reflectivity", "<u2", 24, ("reflectivity", 0)),
-    _ring(26),
-    # Near infrared is not part of a scan; PCL needs the field, it is 0.
-    Field("ambient", "<u2", 28),
-    Field("range", "<u4", 32, ("range_mm_u4", 0)),
-)
-_HESAI = (
-    *_XYZ,
-    _intensity(12),
-    _ring(16),
-    Field("timestamp", "<f8", 18, ("stamp_f8", 0)),
-)
-_AUTOWARE = (
-    *_XYZ,
-    Field("intensity", "u1", 12, values=_intensity_u8),
-    _return_type(13),
-    Field("channel", "<u2", 14, values=_channel),
-    Field("azimuth", "<f4", 16, values=_azimuth),
-    Field("elevation", "<f4", 20, values=_elevation),
-    Field("distance", "<f4", 24, values=_distance),
-    _time_ns("time_stamp", 28),
-)
-_PLY = (
-    *_XYZ,
-    _intensity(12),
-    Field("time", "<f8", 16, ("seconds_f8", 0)),
-    Field("ring", "<i4", 24, ("ring_i4", 0)),
-    _return_type(28),
-    _lidar_id(29),
-)
-
-# Presets of `--point-layout`.
+_STANDARD = "x y z intensity time ring return_type lidar_id"
+# Presets of `--point-layout`. Near infrared (ambient) is not part of a scan; PCL needs the field.
 CLOUD_LAYOUTS = {
     layout.name: layout
     for layout in (
-        Layout("standard", 24, _STANDARD),
-        Layout("velodyne", 22, _VELODYNE),
-        Layout("ouster", 48, _OUSTER, frozenset({"reflectivity", "range_m"})),
-        Layout("hesai", 26, _HESAI),
-        Layout("autoware", 32, _AUTOWARE, frozenset({"reflectivity", BYTE_INTENSITY})),
-        Layout("kiss-icp", 16, (*_XYZ, _time(12))),
-        Layout("minimal", 12, _XYZ),
+        _layout("standard", _STANDARD),
+        _layout("velodyne", "x y z intensity ring time"),
+        _layout(
+            "ouster",
+            "x y z intensity@16 t=time_ns reflectivity ring ambient=u2 range=range_mm@32",
+            ("reflectivity", "range_m"),
+            48,
+        ),
+        _layout("hesai", "x y z intensity ring timestamp=stamp"),
+        _layout(
+            "autoware",
+            "x y z intensity=intensity_u8 return_type channel azimuth elevation distance "
+            "time_stamp=time_ns",
+            ("reflectivity", BYTE_INTENSITY),
+        ),
+        _layout("kiss-icp", "x y z time"),
+        _layout("minimal", "x y z"),
     )
 }
-PLY_LAYOUT = Layout("ply", 30, _PLY)
-# CloudCompare keeps properties whose name contains `scal`, and shows the rest of the name.
-_SCALARS = tuple(field._replace(name=f"scalar_{field.name}") for field in _PLY[3:])
-# small_gicp reads four floats per vertex, whatever the header says.
-_FLOATS = (*_XYZ, _time(12))
+PLY_LAYOUT = _layout("ply", "x y z intensity time=time_f8 ring=ring_i4 return_type lidar_id")
 # By the styles of `--ply-style`.
 PLY_LAYOUTS = {
     "standard": PLY_LAYOUT,
-    "cloudcompare": Layout("ply-cloudcompare", 30, (*_XYZ, *_SCALARS)),
-    "float": Layout("ply-float", 16, _FLOATS),
+    # CloudCompare keeps properties whose name contains `scal`, and shows the rest of the name.
+    "cloudcompare": Layout(
+        "ply-cloudcompare",
+        PLY_LAYOUT.step,
+        (
+            *PLY_LAYOUT.fields[:3],
+            *(field._replace(name=f"scalar_{field.name}") for field in PLY_LAYOUT.fields[3:]),
+        ),
+    ),
+    # small_gicp reads four floats per vertex, whatever the header says.
+    "float": _layout("ply-float", "x y z time"),
 }
-
-
-def _map_layout(name: str, kind: str, end: int) -> Layout:
-    """Points of a map, with times of the clock; kind: of x, y and z, which the writer fills in."""
-    fields = (
-        *(Field(axis, kind, at * end // 3) for at, axis in enumerate("xyz")),
-        *(_intensity(end), Field("time", "<f8", end + 4, ("stamp_f8", 0))),
-        *(_ring(end + 12), _return_type(end + 14), _lidar_id(end + 15)),
-    )
-    return Layout(name, end + 16, fields)
-
-
-MAP_PLY = _map_layout("map-ply", "<f8", 24)
-MAP_PCD = _map_layout("map-pcd", "<f4", 12)
+# Points of a map, with times of the clock; the writer fills in x, y and z.
+_OF_MAP = "intensity time=stamp ring return_type lidar_id"
+MAP_PLY = _layout("map-ply", f"x=f8 y=f8 z=f8 {_OF_MAP}")
+MAP_PCD = _layout("map-pcd", f"x=f4 y=f4 z=f4 {_OF_MAP}")
 # Rows of float32 alone: of KITTI, of nuScenes, and of its times.
-ROWS_KITTI = Layout("kitti", 16, (*_XYZ, _intensity(12)))
-ROWS_NUSCENES = Layout(
-    "nuscenes", 20, (*_XYZ, _intensity(12), Field("ring", "<f4", 16, ("ring_f4", 0)))
-)
-ROWS_TIME = Layout("time", 8, (_time(0), Field("lidar_id", "<f4", 4, ("lidar_f4", 0))))
+ROWS_KITTI = _layout("kitti", "x y z intensity")
+ROWS_NUSCENES = _layout("nuscenes", "x y z intensity ring=ring_f4")
+ROWS_TIME = _layout("time", "time lidar_id=lidar_f4")
