@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, is_dataclass, replace
 from itertools import combinations
 
 import numpy as np
@@ -37,6 +37,7 @@ from mlbatch.poses.solve import (
 )
 from mlbatch.poses.surfaces import distances, shared_cells
 from mlbatch.poses.turning import ImuRotation
+from mlbatch.reports.json_records import to_json
 from mlbatch.units import MM_PER_M, RAD_PER_DEG
 
 # How far a guess may be off; what is found beyond, with some reserve, is no refinement of it.
@@ -76,20 +77,21 @@ STAGES = logging.getLogger("mlbatch.calibrate")
 class LidarPose:
     """The pose of a lidar.
 
-    body_from_sensor: (4, 4), m; sigma_mm: (3,), standard deviation of its origin along x, y, z of
-    the body; sigma_deg: (3,), of turns about them; moved_mm, turned_deg: from the guess;
-    delay_ms: to add to its timestamps, 0 unless asked for. The first lidar stays where it was.
+    body_from_sensor: (4, 4), m; is_fixed: of the first lidar, which stays where it was; sigma_mm:
+    (3,), standard deviation of its origin along x, y, z of the body; sigma_deg: (3,), of turns
+    about them; moved_mm, turned_deg: from the guess; delay_ms: to add to its timestamps, 0 unless
+    asked for.
     """
 
     name: str
     body_from_sensor: F64Array
+    is_fixed: bool
     sigma_mm: F64Array
     sigma_deg: F64Array
-    moved_mm: float
-    turned_deg: float
-    delay_ms: float
-    delay_sigma_ms: float
-    is_fixed: bool
+    moved_mm: float = 0.0
+    turned_deg: float = 0.0
+    delay_ms: float = 0.0
+    delay_sigma_ms: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -198,39 +200,19 @@ class Calibration:
 
     def as_json(self) -> dict[str, object]:
         """The document of `--json`."""
-        return {
-            "schema": SCHEMA,
-            "places": self.places,
-            "held_out": self.held_out,
-            "different": self.different,
-            "windows": self.windows,
-            "steps": self.steps,
-            "level": self.level,
-            "imus": [_imu_as_json(imu) for imu in self.imus],
-            "lidars": [
-                {
-                    "name": lidar.name,
-                    "body_from_sensor": lidar.body_from_sensor.tolist(),
-                    "is_fixed": lidar.is_fixed,
-                    "sigma_mm": lidar.sigma_mm.tolist(),
-                    "sigma_deg": lidar.sigma_deg.tolist(),
-                    "moved_mm": lidar.moved_mm,
-                    "turned_deg": lidar.turned_deg,
-                    "delay_ms": lidar.delay_ms,
-                    "delay_sigma_ms": lidar.delay_sigma_ms,
-                }
-                for lidar in self.lidars
-            ],
-            "pairs": [
-                {
-                    "first": pair.first,
-                    "second": pair.second,
-                    "before": _agreement_as_json(pair.before),
-                    "after": _agreement_as_json(pair.after),
-                }
-                for pair in self.pairs
-            ],
-        }
+        keys = "places held_out different windows steps level imus lidars pairs"
+        return {"schema": SCHEMA, **{key: _as_json(getattr(self, key)) for key in keys.split()}}
+
+
+def _as_json(value: object) -> object:
+    """A record or a value of it; None for what is not known, since JSON has no NaN."""
+    if isinstance(value, tuple):
+        return [_as_json(one) for one in value]
+    if is_dataclass(value):
+        return {one.name: _as_json(getattr(value, one.name)) for one in fields(value)}
+    if isinstance(value, float | np.ndarray) and not np.isfinite(value).all():
+        return None
+    return to_json(value)
 
 
 def _row(lidar: LidarPose, *, has_delay: bool) -> list[str]:
@@ -248,7 +230,7 @@ def _imu_row(imu: ImuRotation) -> list[str]:
     late = "-"
     if np.isfinite(imu.late_ms):
         late = f"{imu.late_ms:.1f} +- {imu.late_sigma_ms:.1f}"
-    return [imu.name, _angles(imu.rotation), numbers(imu.sigma_deg.tolist(), 2), off, late]
+    return [imu.name, _angles(imu.body_from_imu), numbers(imu.sigma_deg.tolist(), 2), off, late]
 
 
 def _angles(rotation: F64Array) -> str:
@@ -260,36 +242,14 @@ def _angles(rotation: F64Array) -> str:
 def imu_note(imu: ImuRotation) -> str:
     """An IMU in a comment of a rig."""
     return (
-        f"{imu.name}: rotation_rpy_deg [{_angles(imu.rotation)}] in the body frame, standard "
+        f"{imu.name}: rotation_rpy_deg [{_angles(imu.body_from_imu)}] in the body frame, standard "
         f"deviations {numbers(imu.sigma_deg.tolist(), 2)} degrees"
     )
-
-
-def _imu_as_json(imu: ImuRotation) -> dict[str, object]:
-    # JSON has no NaN.
-    late = imu.late_ms, imu.late_sigma_ms
-    late_ms, late_sigma_ms = late if np.isfinite(late).all() else (None, None)
-    known = not imu.refusal
-    return {
-        "name": imu.name,
-        "body_from_imu": imu.rotation.tolist() if known else None,
-        "sigma_deg": imu.sigma_deg.tolist() if known else None,
-        "off_deg": imu.off_deg if np.isfinite(imu.off_deg) else None,
-        "late_ms": late_ms,
-        "late_sigma_ms": late_sigma_ms,
-        "refusal": imu.refusal,
-    }
 
 
 def numbers(values: Sequence[float], digits: int) -> str:
     """Numbers with as many decimals, by commas; no -0."""
     return ", ".join(f"{round(value, digits) + 0.0:.{digits}f}" for value in values)
-
-
-def _agreement_as_json(found: Agreement) -> dict[str, object]:
-    # JSON has no NaN.
-    apart_mm = found.apart_mm if np.isfinite(found.apart_mm) else None
-    return {"matched": found.matched, "share": found.share, "apart_mm": apart_mm}
 
 
 def calibrated(
@@ -411,13 +371,8 @@ def by_motion(
     for name, pose, found in zip(names[1:], poses[1:], motion.poses[1:], strict=True):
         covariance = np.matmul(np.matmul(turned, found.covariance), turned.T)
         sigma = np.sqrt(np.diag(covariance))
-        lidars.append(
-            LidarPose(
-                *(name, pose, MM_PER_M * sigma[:3], sigma[3:] / RAD_PER_DEG),
-                *(0.0, 0.0, 0.0, 0.0),
-                is_fixed=False,
-            )
-        )
+        sigma_mm, sigma_deg = MM_PER_M * sigma[:3], sigma[3:] / RAD_PER_DEG
+        lidars.append(LidarPose(name, pose, False, sigma_mm, sigma_deg))
     return Calibration(tuple(lidars), (), 0, 0, 0, windows, None, min(motion.steps))
 
 
@@ -445,13 +400,13 @@ def _lidar_poses(
             LidarPose(
                 names[number],
                 refined[number],
+                False,
                 MM_PER_M * shift,
                 turn / RAD_PER_DEG,
                 MM_PER_M * moved_m,
                 turned_rad / RAD_PER_DEG,
                 MS_PER_S * float(found.state.delay_s[number]),
                 MS_PER_S * float(np.sqrt(covariance[6, 6])) if delays else 0.0,
-                is_fixed=False,
             )
         )
     return tuple(lidars)
@@ -459,8 +414,7 @@ def _lidar_poses(
 
 def fixed(name: str, pose: F64Array) -> LidarPose:
     """The first lidar, whose pose (4, 4) all others are relative to."""
-    still = np.zeros(3)
-    return LidarPose(name, pose, still, still, 0.0, 0.0, 0.0, 0.0, is_fixed=True)
+    return LidarPose(name, pose, True, np.zeros(3), np.zeros(3))
 
 
 def _corrected_poses(poses: Sequence[F64Array], state: State) -> list[F64Array]:

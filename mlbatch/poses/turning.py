@@ -105,13 +105,13 @@ def turning(seen: F64Array, middle_ns: I64Array, turns: Turns, name: str) -> Tur
 class ImuRotation:
     """How an IMU lies, by its turns and those of the first lidar.
 
-    rotation: (3, 3), body_from_imu; sigma_deg: (3,), about x, y, z of the body; off_deg: from the
-    rotation that metadata or /tf_static give, NaN without; late_ms, late_sigma_ms: of its stamps,
-    NaN where it turns too evenly; refusal: why none of it is known, or "".
+    body_from_imu: (3, 3); sigma_deg: (3,), about x, y, z of the body; off_deg: from the rotation
+    that metadata or /tf_static give, NaN without; late_ms, late_sigma_ms: of its stamps, NaN where
+    it turns too evenly; refusal: why none of it is known (NaN), or "".
     """
 
     name: str
-    rotation: F64Array
+    body_from_imu: F64Array
     sigma_deg: F64Array
     off_deg: float
     late_ms: float
@@ -145,8 +145,8 @@ def imu_rotation(
 
 def refused_imu(name: str, reason: str) -> ImuRotation:
     """An IMU that the motion does not fix."""
-    unknown = np.full(3, np.nan)
-    return ImuRotation(name, np.eye(3), unknown, np.nan, np.nan, np.nan, reason)
+    unknown = np.full((4, 3), np.nan)
+    return ImuRotation(name, unknown[:3], unknown[3], np.nan, np.nan, np.nan, reason)
 
 
 def turns_too_little(turns: Turns, name: str) -> str:

@@ -237,7 +237,7 @@ def test_motion_needs_no_guess(tmp_path: Path) -> None:
     assert true_pose(read_rig(rig), "right").tobytes() == right.body_from_sensor.tobytes()
     # The axes of the IMU of an Ouster are those of its sensor frame.
     (imu,) = found.imus
-    imu_error_deg = np.rad2deg(log_rotation(imu.rotation[None])[0])
+    imu_error_deg = np.rad2deg(log_rotation(imu.body_from_imu[None])[0])
     assert not imu.refusal
     assert (np.abs(imu_error_deg) < np.minimum(4 * imu.sigma_deg, 2.0)).all()
     assert "; the IMU of left: rotation_rpy_deg [" in rig.read_text(encoding="utf-8")
