@@ -26,6 +26,7 @@ from mlbatch.page.templates import Verdict, asset, page_json, render
 from mlbatch.page.windows import Windows, read_windows, summarise
 from mlbatch.page.words import COSTS, MEANINGS, SERVICES
 from mlbatch.reports.report import RunReport, SensorReport, Unassigned
+from mlbatch.types import CLOUDS
 from mlbatch.units import NS_PER_MS
 
 _WORDS = {
@@ -293,6 +294,9 @@ def _accounts(report: RunReport) -> dict[str, dict[str, list[dict[str, object]]]
             },
             "Points": {name: getattr(points, name) for name in _OUTCOMES},
         }
+        if sensor.model in CLOUDS:
+            # Slots that no point of the cloud fills say nothing of its lidar.
+            del accounts["Points"]["no_return"]
         for title, counts in accounts.items():
             found.setdefault(title, {})[sensor.name] = _shares(counts)
     return found

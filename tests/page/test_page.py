@@ -222,6 +222,18 @@ def test_a_dry_run_has_a_page_without_scans(shell: Shell) -> None:
     assert "The scans are not available" in Path("page.html").read_text(encoding="utf-8")
 
 
+@pytest.mark.parametrize(("model", "share"), [("OS-1-32-U1", "80.0 %"), ("PointCloud2", "88.9 %")])
+def test_slots_that_no_point_of_a_cloud_fills_are_not_counted(
+    model: str, share: str, shell: Shell
+) -> None:
+    # Of 1,000 slots 100 have no point and 800 are written; 800 of 900 are 88.9 %.
+    Path("run.json").write_text(text(report({**sensor("left"), "model": model})))
+    assert shell("report run.json -o page.html").code == 0
+    page = Path("page.html").read_text(encoding="utf-8")
+    assert f"in the output 800 ({share})" in page
+    assert ("no return 100" in page) == (share == "80.0 %")
+
+
 def test_a_report_alone_makes_a_page_that_says_what_it_lacks(shell: Shell) -> None:
     Path("run.json").write_text(text(report(sensor("left"))), encoding="utf-8")
     assert shell("report run.json").out == "wrote run.html\n"
