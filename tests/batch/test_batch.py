@@ -8,7 +8,6 @@ import os
 import shutil
 import signal
 import threading
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -22,7 +21,6 @@ from mlbatch.batch.plan import (
     USUAL_START_S,
     Plan,
     PlannedSession,
-    plan_of,
 )
 from mlbatch.batch.task import tasks_of
 from mlbatch.errors import Interrupted
@@ -242,16 +240,6 @@ def test_fail_fast_begins_no_other_session(tmp_path: Path) -> None:
     assert ended.last == "3 sessions: 0 done, 0 skipped, 1 failed, 2 not begun (--fail-fast)"
 
 
-def test_a_mistake_in_the_rig_of_all_begins_no_session(good: Dataset, tmp_path: Path) -> None:
-    ended = run(good, tmp_path / "out", "-r", "missing.yaml")
-    assert (ended.code, ended.out) == (1, "")
-    assert ended.err == (
-        "mlbatch: error: missing.yaml: expected a readable file, found no such file or directory; "
-        "check the path\n"
-    )
-    assert not (tmp_path / "out").exists()
-
-
 def test_a_plan_writes_nothing(good: Dataset, tmp_path: Path) -> None:
     """Of parts, too, which are disjoint and whole."""
     out = tmp_path / "out"
@@ -287,20 +275,6 @@ def test_a_plan_counts_the_start_of_sessions(
     sizes: list[int], workers: int, cores: int, expected_s: float
 ) -> None:
     assert _plan(sizes, workers, cores).seconds == pytest.approx(expected_s)
-
-
-def test_a_plan_of_finished_sessions_is_their_time(good: Dataset, tmp_path: Path) -> None:
-    """As many sessions of the same size again take as long again."""
-    out = tmp_path / "out"
-    assert run(good, out).code == 0
-    records = [json.loads(path.read_text()) for path in out.glob("*/session.json")]
-    sessions = sessions_of([str(good.manifest)], Common())
-    tasks = tasks_of(sessions, str(out), tmp_path, retries=0, pages=True)
-    plan = plan_of(tasks, 1)
-    assert plan.source == "from 4 finished sessions"
-    again = replace(plan, sessions=tuple(replace(one, word="missing") for one in plan.sessions))
-    wall_s = sum(record["wall_s"] for record in records)
-    assert again.seconds == pytest.approx(wall_s, rel=0.05)
 
 
 def test_a_foreign_folder_is_not_touched(good: Dataset, tmp_path: Path) -> None:

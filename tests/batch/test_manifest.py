@@ -8,7 +8,7 @@ import pytest
 
 from mlbatch.batch.identity import session_key
 from mlbatch.batch.manifest import Common, chosen, sessions_of
-from mlbatch.batch.session import OWN, Option, Session
+from mlbatch.batch.session import Option, Session
 from mlbatch.errors import MlbatchError, RigError, UsageError
 from mlbatch.pipeline.job import Shard
 from mlbatch.rig.recipes import FOLDER
@@ -285,19 +285,6 @@ def test_only_names_sessions() -> None:
     assert [one.name for one in chosen(sessions("ab"), ("b",), Shard(1, 1))] == ["b"]
     with pytest.raises(UsageError, match="nearest is drive"):
         chosen([Session("drive", ())], ("driev",), Shard(1, 1))
-
-
-OWN_FILES = (
-    *("scans.mcap", "scans", "scans.bag", "scans.mcap.partial", "scans.mcap.partial.state"),
-    *("scans.seg2.mcap", "scans.mcap.scans.csv", "report.json", "report.seg2.json"),
-    *("page.html", "log.txt", "session.json", "started.json", "session.json.partial"),
-)
-OTHER_FILES = ("scans.txt", "my scans.mcap", "scans.mcap.bak", "report.pdf", "rig.yaml")
-
-
-def test_only_files_of_runs_are_removed() -> None:
-    assert all(OWN.fullmatch(name) for name in OWN_FILES)
-    assert not any(OWN.fullmatch(name) for name in OTHER_FILES)
 
 
 KIT = "base_link: {{lidar: {{x: {}, y: 0, z: 0, roll: 0, pitch: 0, yaw: 0}}}}\n"

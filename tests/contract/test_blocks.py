@@ -199,13 +199,6 @@ def test_options_in_the_text_exist(page: Path) -> None:
             assert set(OPTION.findall(code)) <= known, code
 
 
-def test_calls_are_found() -> None:
-    script = 'mlbatch convert "$1" -o OUT --jobs "${CPUS}"  # one each'
-    assert calls(script, "mlbatch") == [["convert", "1", "-o", "OUT", "--jobs", "1"]]
-    line = "mlbatch convert a -o b && mlbatch verify b | tee log > mlbatch; mlbatch sensors"
-    assert calls(line, "mlbatch") == [["convert", "a", "-o", "b"], ["verify", "b"], ["sensors"]]
-
-
 @pytest.mark.parametrize(
     ("line", "error"),
     [
@@ -218,16 +211,3 @@ def test_a_misspelt_option_is_refused(line: str, error: str) -> None:
     # Which exception it is depends on the version of typer, which contains click or needs it.
     with pytest.raises(Exception, match=error):
         _parse(line.split())
-
-
-@pytest.mark.parametrize(
-    ("shown", "printed", "same"),
-    [
-        ("a\n...\nc\n", "a\nb\nb\nc\n", True),
-        ("0.8 s recorded in 0.1 s: 7\n", "0.8 s recorded in 3 s: 9\n", True),
-        ("7 scans\n", "8 scans\n", False),
-        ("a\n...\nc\n", "a\nb\n", False),
-    ],
-)
-def test_shown_output(shown: str, printed: str, same: bool) -> None:
-    assert (re.fullmatch(_pattern(shown), _steady(printed)) is not None) == same

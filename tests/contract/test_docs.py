@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 import runpy
-import shutil
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -12,7 +11,6 @@ import numpy as np
 import pytest
 import yaml
 
-from mlbatch import writers
 from mlbatch.discovery import sampler
 from mlbatch.discovery.calibrations import MAX_CALIBRATION_FILE_BYTES
 from mlbatch.discovery.discover import SensorSelection
@@ -30,8 +28,6 @@ from mlbatch.reports.report import build_report
 from mlbatch.rig import yaml_tree
 from mlbatch.ros.packet_types import PACKET_TYPES
 from mlbatch.sensors import MAX_CALIBRATION_BYTES, models
-from mlbatch.writers import formats
-from mlbatch.writers.base import WriterOptions
 from mlbatch.writers.formats import format_names
 from mlbatch.writers.point_layouts import CLOUD_LAYOUTS, PLY_LAYOUT
 from tests.bench.cases import CASES, RECORDINGS
@@ -75,14 +71,6 @@ def test_the_table_of_sensors_is_up_to_date(tmp_path: Path) -> None:
     copy.write_text(MODELS, encoding="utf-8")
     run_python(f"import runpy, sys; sys.argv[1:] = [{str(copy)!r}]\n{MAKE_TABLE}")
     assert copy.read_text(encoding="utf-8") == MODELS, "run python docs/sensors_table.py"
-
-
-def test_the_table_of_sensors_names_every_model() -> None:
-    table = MODELS.partition("<!-- sensors:")[2].partition("<!-- end of sensors")[0]
-    for model in models():
-        row = next(row for row in _rows(table) if model.name in re.split(r", | \(", row[1]))
-        assert (row[0], row[-1]) == (model.vendor, model.verified)
-        assert f"| {model.verified} | " in MODELS, "say what the word means"
 
 
 @pytest.mark.parametrize("name", CLOUD_LAYOUTS)
@@ -163,10 +151,6 @@ def _warning_codes() -> set[str]:
     return codes
 
 
-def test_every_warning_is_described() -> None:
-    assert _warning_codes() <= _first_cells(_page("report.md"))
-
-
 @pytest.mark.parametrize("page", LINKED, ids=lambda page: page.relative_to(ROOT).as_posix())
 def test_links_lead_somewhere(page: Path) -> None:
     """To a file of the repository, and to a heading or anchor of it."""
@@ -215,6 +199,7 @@ def test_every_warning_has_a_section_with_its_remedy() -> None:
     page = runpy.run_path(str(ROOT / "docs" / "site_pages.py"))["warnings_page"]()
     sections = re.findall(r"^## (\w+)$", page, re.MULTILINE)
     assert _warning_codes() <= set(sections) == set(REMEDIES)
+    assert _warning_codes() <= _first_cells(_page("report.md"))
     assert page.count("**What to do:**") == len(sections)
 
 
@@ -275,14 +260,6 @@ def test_bounds_of_untrusted_input_are_those_of_the_code(
     assert numbers == list(bounds)
 
 
-def test_tables_of_the_site_show_bars_in_code() -> None:
-    """Git hosts need `a\\|b` in a cell; the renderer of the site would show the backslash."""
-    site = runpy.run_path(str(ROOT / "docs" / "site_pages.py"))
-    page = site["with_plain_bars"](site["options_page"]())
-    assert "`--batching-times [common|own]`" in page
-    assert "\\|" not in page
-
-
 def test_the_site_needs_no_server_and_no_other_site() -> None:
     """Its search neither: the script that `offline` would load from unpkg.com is one of ours."""
     settings = yaml.safe_load((ROOT / "mkdocs.yml").read_text("utf-8"))
@@ -304,20 +281,3 @@ def test_recordings_are_neither_denied_nor_kept_secret() -> None:
     denied = [row[0] for row in _rows(_page("sensors.md")) if "no recording" in " ".join(row[1:])]
     assert denied
     assert not real & {name for cell in denied for name in cell.split(", ")}
-
-
-def test_the_example_of_a_writer_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Saved in a folder of formats, as extend.md says, it is found and writes every point."""
-    shutil.copy(ROOT / "examples" / "mlbatch-example" / "mlbatch_example" / "rawf32.py", tmp_path)
-    monkeypatch.setattr(formats, "__path__", [*formats.__path__, str(tmp_path)])
-    format_names.cache_clear()
-    try:
-        job = Job((ROOT / FIXTURE,), SensorSelection(rig=ROOT / RIG), extras=frozenset())
-        options = WriterOptions()
-        target = tmp_path / "scans"
-        _, report = convert(job, lambda info: writers.open_writer("rawf32", target, info, options))
-    finally:
-        format_names.cache_clear()
-    files = sorted(target.glob("*.rawf32"))
-    assert len(files) == report.scans.written
-    assert sum(path.stat().st_size for path in files) == 16 * report.scans.points > 0

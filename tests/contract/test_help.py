@@ -69,13 +69,6 @@ OPTIONS["batch"] |= _PASSED
 HEAVY = ("numpy", "yaml", "mcap", "zstandard", "rich.progress")
 
 
-def _help(*arguments: str) -> str:
-    app = command_line(*arguments[:1])
-    result = CliRunner().invoke(app, [*arguments, _whole(*arguments)], env={"COLUMNS": "200"})
-    assert result.exit_code == 0
-    return " ".join(result.stdout.split())
-
-
 def _whole(command: str = "") -> str:
     """What shows all options of a command."""
     return "--help-all" if command in COMMON else "--help"
@@ -108,17 +101,6 @@ def test_a_command_is_the_same_without_the_others(command: str) -> None:
     assert list(alone) == [command]
     options = [one.opts for one in alone[command].params]
     assert options == [one.opts for one in _commands()[command].params]
-
-
-@pytest.mark.parametrize("first", ["", "convrt", "--help"])
-def test_other_words_leave_all_commands(first: str) -> None:
-    assert tuple(_commands(first)) == COMMANDS
-
-
-def test_the_first_page_names_every_command() -> None:
-    page = _help()
-    for command in (*OPTIONS, "--version"):
-        assert re.search(rf" {command} \S", page), command
 
 
 @pytest.mark.parametrize("command", OPTIONS)

@@ -82,11 +82,6 @@ def test_a_build_asks_for_a_compiler_only_where_none_is(
     assert ask(None) == []
 
 
-def test_the_command_is_what_it_says() -> None:
-    assert _settings("project", "scripts")["mlbatch"] == "mlbatch.cli:main"
-    assert re.fullmatch(r"\d+\.\d+\.\d+", mlbatch.__version__)
-
-
 def test_the_lowest_versions_are_those_that_are_tested() -> None:
     extras = _settings("project", "optional-dependencies")
     lists = (_settings("project")["dependencies"], *extras.values())
@@ -129,12 +124,6 @@ def _top(node: ast.AST) -> str:
     return ""
 
 
-def test_licence_and_readme_are_there() -> None:
-    assert "MIT License" in Path(ROOT / "LICENSE").read_text(encoding="utf-8")
-    assert _settings("project")["license"] == "MIT"
-    assert (ROOT / str(_settings("project")["readme"])).is_file()
-
-
 def test_metadata_names_no_person_and_no_address() -> None:
     project = _settings("project")
     assert str(project["authors"]) == "[{'name': 'The mlbatch authors'}]"
@@ -150,12 +139,6 @@ def test_the_citation_is_of_this_version_and_of_the_paper() -> None:
     batching = " ".join((ROOT / "docs" / "batching.md").read_text(encoding="utf-8").split())
     assert f'{names} ({paper["year"]}), "{paper["title"]}"' in batching
     assert "doi" not in paper
-
-
-def test_the_changelog_has_this_version() -> None:
-    changes = (ROOT / "CHANGELOG.md").read_text(encoding="utf-8")
-    assert f"## {mlbatch.__version__}\n" in changes
-    assert "## Unreleased\n" in changes
 
 
 def test_nothing_installs_the_package_of_others() -> None:

@@ -42,10 +42,3 @@ def test_picture_shows_each_lidar_in_its_colour(tmp_path: Path) -> None:
     # Orange has more red than blue, cyan more blue than red.
     assert (pixels[:, 0] > pixels[:, 2] + 80 / 255).any()
     assert (pixels[:, 2] > pixels[:, 0] + 80 / 255).any()
-
-
-def test_picture_of_nothing_is_refused_in_one_line(tmp_path: Path) -> None:
-    done = run("picture.py", tmp_path, tmp_path / "out.png")
-    assert done.returncode == 1
-    assert done.stderr.count("\n") == 1
-    assert "expected a folder of npz scans, found none; convert" in done.stderr

@@ -106,16 +106,6 @@ def test_the_wall_is_flat(shell: Shell, tmp_path: Path, model: str, suffix: str)
     assert shell("verify imu").code == 0
 
 
-def test_imu_poses_do_not_depend_on_jobs(shell: Shell, tmp_path: Path) -> None:
-    text = scenario_text(SENSORS, scene=SCENE, motion=MOTION, duration=3.0, more=IMU)
-    drive = record(tmp_path, text, "mcap")
-    words = f"convert {drive.path} --rig {drive.rig} -q --deskew imu"
-    assert shell(f"{words} -o one.mcap").code == 0
-    assert shell(f"{words} -o two.mcap --jobs 3 --max-wait 0.3").code == 0
-    one, two = Path("one.mcap"), Path("two.mcap")
-    assert one.read_bytes() == two.read_bytes()
-
-
 def test_the_end_of_a_selection_needs_later_samples_of_the_imu(
     shell: Shell, tmp_path: Path
 ) -> None:

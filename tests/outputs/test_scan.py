@@ -32,14 +32,6 @@ def test_times_of_points() -> None:
     assert scan.stamp_ns.tolist() == [scan.start_ns + 62_500_000]
 
 
-def test_description() -> None:
-    scan = Scan.copied(dense_scan())
-    assert (scan.sensors, scan.frame_id) == (("left", "right"), "base_link")
-    assert (scan.rate_hz, scan.timescale, scan.slices) == ("10", "utc", 1)
-    assert scan.point_count == 1000
-    assert repr(scan).startswith("<Scan 0: 1000 points of left, right, 1700000000100000000 to ")
-
-
 def test_the_parts_of_sensors_are_the_whole() -> None:
     scan = Scan.copied(dense_scan())
     left, right = scan["left"], scan["right"]

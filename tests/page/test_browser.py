@@ -9,13 +9,12 @@ import numpy as np
 import pytest
 
 from mlbatch.page import Source, write_page
-from mlbatch.page.templates import render
 from mlbatch.reports.report import RunReport
 from tests.builders.sessions import FIXTURE
 from tests.contract.tree import run_mlbatch
 from tests.page.browser import CHROMIUM, NO_CHROMIUM, Browser
 from tests.page.runs import report, sensor, table
-from tests.page.test_page import HOSTILE, plot_data, points_of
+from tests.page.test_page import plot_data, points_of
 
 pytestmark = pytest.mark.skipif(CHROMIUM is None, reason=NO_CHROMIUM)
 
@@ -216,55 +215,3 @@ def test_a_browser_that_cannot_unpack_says_so(tab: Browser, real_page: Path) -> 
         assert tab.run("document.getElementById('stage').hidden")
     assert "no DecompressionStream" in why
     assert tab.errors == []
-
-
-@pytest.mark.parametrize("width", [1200, 400])
-def test_a_batch_fits_its_page(width: int, tab: Browser, tmp_path: Path) -> None:
-    """Cards fill their rows, and no cell of the table is cut."""
-    head = ("session", "state", "scans", "lost", "output", "time", "")
-    cells = dict(
-        zip(head, ("drive 1", "failed", "9", "0.00 %", "9.9 MB", "3 s", "x " * 90), strict=True)
-    )
-    row = {"cells": cells, "badge": "problem", "levels": dict.fromkeys(head, ""), "page": ""}
-    cards = {f"sessions with {number}": str(number) for number in range(11)}
-    path = tmp_path / "page.html"
-    path.write_text(render("batch.html", title="out", cards=cards, head=head, rows=[row] * 2))
-    tab.open(path, width=width)
-    rights = "[...document.querySelectorAll('.card')].map(c => c.getBoundingClientRect())"
-    (last, most) = tab.run(f"(b => [b.at(-1).right, Math.max(...b.map(c => c.right))])({rights})")
-    assert last == pytest.approx(most, abs=1)
-    scroll = "(s => s.scrollWidth - s.clientWidth)(document.querySelector('.scroll'))"
-    assert tab.run(scroll) <= 0
-
-
-def test_hostile_names_run_nothing(tab: Browser, tmp_path: Path) -> None:
-    warning = {"code": HOSTILE, "sensor": HOSTILE, "message": HOSTILE}
-    document = report(sensor(HOSTILE), sensor("right", 1), warnings=[warning], command=HOSTILE)
-    csv = table(("left", "right"), [[512, 512]] * 5)
-    tab.open(page_of(tmp_path, Source(RunReport.from_json(document), csv, None, tmp_path)))
-    assert tab.errors == []
-    assert tab.run("document.querySelectorAll('img').length") == 0
-    assert tab.run("document.querySelectorAll('script').length") == 2
-    assert tab.run("document.getElementById('command').textContent") == HOSTILE
-
-
-def test_an_hour_of_four_lidars_is_small_and_opens_quickly(tab: Browser, tmp_path: Path) -> None:
-    names = ("front", "left", "rear", "right")
-    draw = np.random.default_rng(0)
-    lost = draw.binomial(32, 0.02, (36_000, 4)) * 16
-    columns = (512 - lost).tolist()
-    sensors = [sensor(name, i, drift_ppm=i) for i, name in enumerate(names)]
-    csv = table(names, columns, 512)
-    source = Source(RunReport.from_json(report(*sensors, scans=36_000)), csv, None, tmp_path)
-    page = page_of(tmp_path, source)
-    # Scans of the output would add 3 MB.
-    assert page.stat().st_size < 2_500_000
-    tab.open(page)
-    assert tab.errors == []
-    drawn_ms = int(tab.run("document.documentElement.dataset.drawn"))
-    # 2 s on a free machine; here others may run.
-    assert drawn_ms < 20_000
-    looks = tab.run(LOOK)
-    # All else is constant.
-    assert [look[0] for look in looks] == ["timeline", "points"]
-    assert all(share > 0.005 and colours > 3 for _, share, colours, _, _ in looks)

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import re
 from typing import Any
 
 import pytest
 
-from mlbatch.page.findings import REMEDIES, Level, findings, percent, verdict
+from mlbatch.page.findings import Level, findings, percent, verdict
 from mlbatch.page.windows import read_windows
 from mlbatch.reports.report import RunReport
-from tests.contract.tree import PACKAGE, ROOT
 from tests.page.runs import report, sensor, table
 
 
@@ -169,15 +167,6 @@ def test_the_verdict_is_the_worst_finding() -> None:
 
 def test_a_run_without_a_scan_is_a_problem() -> None:
     assert found(report(sensor("left"), scans=0)) == ["PROBLEM: No scan was written."]
-
-
-def test_every_warning_has_a_remedy() -> None:
-    page = (ROOT / "docs" / "report.md").read_text(encoding="utf-8")
-    described = re.findall(r"^\| `(\w+)` \|", page.partition("### warnings")[2], re.MULTILINE)
-    assert described
-    assert set(described) <= set(REMEDIES)
-    source = "".join(path.read_text(encoding="utf-8") for path in PACKAGE.rglob("*.py"))
-    assert set(re.findall(r'\bNote\(\s*"(\w+)"', source)) <= set(REMEDIES)
 
 
 @pytest.mark.parametrize(

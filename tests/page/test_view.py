@@ -190,21 +190,6 @@ def test_an_error_comes_after_its_scans_and_is_said_once() -> None:
     assert scans.error == str(error)
 
 
-def test_a_source_that_is_gone_is_an_error() -> None:
-    sources = [some_scans(40)]
-
-    def begin() -> Iterator[mlbatch.Scan]:
-        if not sources:
-            raise RecordingError("drive.pcap: expected a file, found none; restore it")
-        return sources.pop()
-
-    said: list[str] = []
-    scans = ViewScans(begin, said.append)
-    assert header_of(scans.get(39))["title"] == "Scan 39, +3.9 s"
-    assert "restore it" in header_of(scans.get(1))["error"]
-    assert len(said) == 1
-
-
 def test_a_damaged_output_says_where(tmp_path: Path) -> None:
     output = convert(tmp_path, "s")
     (output / "000003.npz").write_bytes(b"damaged")

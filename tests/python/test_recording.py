@@ -21,7 +21,7 @@ from mlbatch.python.options import output_job, session_job, window_job
 from mlbatch.python.recording import Recording
 from tests.builders.run import command
 from tests.builders.sessions import CAPTURE, FIXTURE, RIG, Unit, twin, write_session
-from tests.contract.tree import ROOT, run_python
+from tests.contract.tree import ROOT
 from tests.python.test_dataset import assert_equal
 
 FOUR_RIG = ROOT / "fixtures/four_makers/rig.yaml"
@@ -80,35 +80,23 @@ def test_unknown_extrinsics_are_an_error_of_scans_only(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("metadata", "sensors"),
-    [("left.json", 1), (Path("left.json"), 1), (["left.json", "right.json"], 2)],
+    ("recordings", "options", "sensors"),
+    [
+        # The right sensor is left out where its metadata are not given.
+        (("two_lidars.pcap",), {"metadata": "left.json", "ignore": "122648000456"}, 1),
+        (("two_lidars.pcap",), {"metadata": Path("left.json"), "ignore": ["122648000456"]}, 1),
+        (("two_lidars.pcap",), {"metadata": ["left.json", "right.json"]}, 2),
+        ((CAPTURE,), {"rig": str(RIG), "only": "right"}, 1),
+        (([CAPTURE],), {"rig": RIG, "ignore": ["right"]}, 1),
+        ((iter([str(CAPTURE)]),), {"rig": RIG}, 2),
+    ],
 )
 def test_a_text_is_one_path(
-    metadata: str | Path | list[str], sensors: int, monkeypatch: pytest.MonkeyPatch
+    recordings: Any, options: dict[str, Any], sensors: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(FIXTURE)
-    # The right sensor is left out where its metadata are not given.
-    ignore = "122648000456" if sensors == 1 else ()
-    rec = mlbatch.open(
-        "two_lidars.pcap", metadata=metadata, ignore=ignore, identity_extrinsics=True
-    )
-    assert len(rec.sensors) == sensors
-    scans = mlbatch.scans(
-        "two_lidars.pcap", metadata=metadata, ignore=ignore, identity_extrinsics=True
-    )
-    assert len(next(scans).sensors) == sensors
-
-
-@pytest.mark.parametrize(
-    "recordings", [(str(CAPTURE),), (CAPTURE,), ([CAPTURE],), (iter([str(CAPTURE)]),)]
-)
-def test_recordings_are_paths_or_several(recordings: tuple[Path, ...]) -> None:
-    assert list(mlbatch.open(*recordings, rig=str(RIG)).sensors) == ["left", "right"]
-
-
-def test_one_name_of_a_sensor() -> None:
-    assert list(mlbatch.open(CAPTURE, rig=RIG, only="right").sensors) == ["right"]
-    assert list(mlbatch.open(CAPTURE, rig=RIG, ignore=["right"]).sensors) == ["left"]
+    rec = mlbatch.open(*recordings, identity_extrinsics="rig" not in options, **options)
+    assert len(rec.sensors) == len(next(rec.scans()).sensors) == sensors
 
 
 # -- scans ----------------------------------------------------------------------------------------
@@ -178,12 +166,6 @@ def test_a_part_of_the_recording(rec: Recording) -> None:
         found = list(rec.scans(start=start, end=end))
         assert [scan.index for scan in found] == [2, 3], start
         assert found[0].start_ns == FIRST_NS + 2 * PERIOD_NS
-
-
-@pytest.mark.parametrize("start", [1.5, True, "tomorrow"])
-def test_times_that_are_none(start: int, rec: Recording) -> None:
-    with pytest.raises(UsageError, match="start: expected "):
-        next(rec.scans(start=start))
 
 
 def _without_middle(capture: Path) -> Path:
@@ -364,6 +346,7 @@ def test_packets_of_no_sensor(rec: Recording) -> None:
 @pytest.mark.parametrize(
     ("options", "expected"),
     [
+        *(({"start": start}, "start: expected ") for start in (1.5, True, "tomorrow")),
         ({"layout": "flat"}, "layout: expected dense or organized, found 'flat'"),
         ({"drop_incomplete": 101}, "drop_incomplete: expected a number from 0 to 100, found 101; "),
         ({"exclude_boxes": [(0, 0, 0, 1, 1)]}, "exclude_boxes: expected"),
@@ -411,32 +394,3 @@ def test_a_path_of_another_type() -> None:
         mlbatch.open(3)  # type: ignore[arg-type]
     with pytest.raises(UsageError, match="recording: expected at least one path, found none"):
         mlbatch.open()
-
-
-def test_importing_the_package_loads_nothing() -> None:
-    printed = run_python(
-        "import sys\nimport mlbatch\n"
-        "print([name for name in sys.modules if name.startswith('mlbatch.') or name == 'numpy'])\n"
-        "print(callable(mlbatch.verify), callable(mlbatch.digest))\n"
-    )
-    assert printed.splitlines() == ["[]", "True True"]
-
-
-def test_a_missing_recording_is_named_at_the_call() -> None:
-    with pytest.raises(RecordingError, match=r"none\.pcap: expected a recording, found no such"):
-        mlbatch.scans("none.pcap")
-    with pytest.raises(UsageError, match="layout: expected dense or organized"):
-        mlbatch.scans("none.pcap", layout="sparse")
-    with pytest.raises(UsageError, match="clock: expected sensor or host, found 'gps'"):
-        mlbatch.scans(CAPTURE, clock="gps")
-
-
-def test_the_part_of_a_sensor_names_that_alone(rec: Recording) -> None:
-    scan = rec[0]
-    assert "points of left, right, " in repr(scan)
-    assert "points of left, 1" in repr(scan["left"])
-    assert "points of right, 1" in repr(scan["right"])
-    assert {one.sensor: repr(one).split()[5] for one in rec.scans(split=True)} == {
-        "left": "left,",
-        "right": "right,",
-    }

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 import mlbatch
-from mlbatch.errors import ExportError, NoScanError, UsageError
+from mlbatch.errors import UsageError
 from mlbatch.pipeline import preflight
 from tests.builders.sessions import CAPTURE, RIG
 
@@ -27,27 +27,6 @@ def test_the_report_of_a_run(tmp_path: Path) -> None:
     assert str(run.report).splitlines()[1].split()[0] == "left"
 
 
-def test_a_dry_run_writes_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
-    run = mlbatch.convert(CAPTURE, None, rig=RIG)
-    assert (run.path, run.report_path) == (None, None)
-    assert run.report.scans.points == 195986
-    assert list(tmp_path.iterdir()) == []
-    run = mlbatch.convert(CAPTURE, None, rig=RIG, report="report.json")
-    assert [path.name for path in tmp_path.iterdir()] == ["report.json"]
-
-
-def test_an_existing_output_is_kept(tmp_path: Path) -> None:
-    output = tmp_path / "scans.mcap"
-    mlbatch.convert(CAPTURE, output, rig=RIG)
-    before = output.read_bytes()
-    with pytest.raises(ExportError, match="expected a new output, found an existing one"):
-        mlbatch.convert(CAPTURE, output, rig=RIG, rate=20)
-    assert output.read_bytes() == before
-    mlbatch.convert(CAPTURE, output, rig=RIG, rate=20, overwrite=True)
-    assert output.read_bytes() != before
-
-
 def test_a_warning_names_the_line_of_the_caller(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -56,12 +35,6 @@ def test_a_warning_names_the_line_of_the_caller(
         mlbatch.convert(CAPTURE, tmp_path / "scans.mcap", rig=RIG)
     own = [one for one in warned if one.category is UserWarning]
     assert [one.filename for one in own] == [__file__]
-
-
-def test_a_run_without_a_scan_leaves_nothing(tmp_path: Path) -> None:
-    with pytest.raises(NoScanError):
-        mlbatch.convert(CAPTURE, tmp_path / "scans.mcap", rig=RIG, start="+100")
-    assert list(tmp_path.iterdir()) == []
 
 
 def test_options_of_an_opened_recording_are_given_there(tmp_path: Path) -> None:
@@ -86,9 +59,3 @@ def test_verify_is_a_function_before_and_after_its_import(tmp_path: Path) -> Non
     data[len(data) // 2] ^= 1
     output.write_bytes(data)
     assert not mlbatch.verify(output).ok
-
-
-def test_inspect() -> None:
-    found = mlbatch.inspect(str(CAPTURE))
-    assert [stream.sensor for stream in found.streams if stream.model] != []
-    assert mlbatch.inspect([CAPTURE], whole=True).whole
