@@ -14,14 +14,17 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from mlbatch import sensors
-from mlbatch.arrays import I64Array
+from mlbatch.arrays import I64Array, U8Array
 from mlbatch.batching.intake import NEVER, extremes
-from mlbatch.discovery.sampler import KindFilter, split_by_kind
-from mlbatch.discovery.types import DetectedSensor
+from mlbatch.discovery.first_seconds import FIRST_NS
+from mlbatch.discovery.router import Role
+from mlbatch.discovery.sampler import SAMPLES_PER_KIND, KindFilter, split_by_kind
+from mlbatch.discovery.types import DetectedSensor, PacketKind
 from mlbatch.errors import MlbatchError, RecordingError
 from mlbatch.lidar.headers import content_keys
 from mlbatch.lidar.interface import Lidar
@@ -29,6 +32,9 @@ from mlbatch.readers import open_recording
 from mlbatch.readers.byte_records import records
 from mlbatch.types import PacketBatch, Recording, Stream, StreamTable
 from mlbatch.units import NS_PER_MS, NS_PER_S
+
+if TYPE_CHECKING:
+    from mlbatch.discovery.discover import Discovery
 
 # Largest time between recordings with a lidar in common: a break in a day of work, but not a day.
 MAX_BREAK_NS = 24 * 3600 * NS_PER_S
@@ -311,3 +317,95 @@ def lidar_name(stream: Stream, what: str) -> str:
     """Name of a lidar without a sensor: its serial number, which may move, else its stream."""
     serial = re.search(r"serial \w+", what)
     return serial[0] if serial else str(stream)
+
+
+# -- packets of a run -----------------------------------------------------------------------------
+
+
+class RunOverlap:
+    """Follows the packets of several recordings; an error as soon as they are no session."""
+
+    def __init__(self, recordings: Sequence[Recording], setup: Discovery) -> None:
+        self._setup = setup
+        self._spans = {id(one): LidarSpan(one.path) for one in recordings}
+        self._shared = SharedLidars()
+        self._kind_filters = {id(one): KindFilter() for one in recordings}
+        # By recording and kind, as lidars of several recordings may have one address.
+        self._lidars: dict[tuple[int, PacketKind], list[str]] = {}
+        self._begun_ns: int | None = None
+        self._is_settled = False
+
+    def add(self, recording: Recording, batch: PacketBatch | None) -> None:
+        """Add the next packets of a recording; None: it has no more."""
+        span = self._spans[id(recording)]
+        if batch is None:
+            span.is_whole = True
+            return
+        is_new = span.first_ns is None
+        parts = split_by_kind(batch)
+        for kind, index in self._kind_filters[id(recording)].followed(batch, parts):
+            key = id(recording), kind
+            names = self._lidars.get(key)
+            if names is None:
+                first = batch.start[index[:SAMPLES_PER_KIND], None] + np.arange(kind.size)
+                names = list(self._names(kind, batch.data[first]))
+                self._lidars[key] = names
+            host_ns = batch.host_ns[index]
+            for name in names:
+                span.add(name, int(host_ns.min()), int(host_ns.max()))
+            for sensor in self._setup.sensors:
+                if sensor.name in names:
+                    self._shared.add(recording, sensor, batch, index)
+        newest_ns = int(batch.host_ns[-1])
+        if is_new and span.first_ns is not None:
+            self._begun_ns = newest_ns
+            self._is_settled = False
+            self._refuse(are_all_known=False)
+        elif (
+            not self._is_settled
+            and self._begun_ns is not None
+            and newest_ns - self._begun_ns > FIRST_NS
+            and all(one.first_ns is not None or one.is_whole for one in self._spans.values())
+        ):
+            self._is_settled = True
+            self._refuse()
+
+    def finish(self) -> str:
+        """Check all that was read, at the end; gives a warning about optional sensors, or ""."""
+        for span in self._spans.values():
+            span.is_whole = True
+        return self._refuse()
+
+    def _refuse(self, *, are_all_known: bool = True) -> str:
+        """Raise RecordingError if recordings are no session; gives a warning, or ""."""
+        optional = [
+            one.name for one in self._setup.sensors if one.rig is not None and one.rig.optional
+        ]
+        text, is_optional = problem(
+            list(self._spans.values()), optional, are_all_known=are_all_known
+        )
+        if text and not is_optional:
+            raise RecordingError(text)
+        return text
+
+    def _names(self, kind: PacketKind, packets: U8Array) -> Iterator[str]:
+        """Lidars that sent packets (k, size) of a kind, but for those that the user left out."""
+        setup = self._setup
+        stream = setup.sampler.table.streams[kind.stream]
+        route = setup.router.route(kind, packets[0])
+        if route.role in (Role.IMU, Role.BAD_SIZE):
+            return
+        owned = np.zeros(len(packets), np.bool_)
+        for number in route.sensors:
+            sensor = setup.sensors[number]
+            own = sensor.lidar.sent_by_me(packets[:, : sensor.lidar.packet_size])
+            owned |= own
+            if own.any():
+                yield sensor.name
+        others = packets[~owned]
+        if setup.rig is not None or setup.ignored.all_others or not len(others):
+            return
+        others = others[~setup.ignored.packets(stream, kind, others)]
+        what = sensors.describe(kind.size, others[:1]) if len(others) else None
+        if what is not None and "lidar" in what:
+            yield lidar_name(stream, what)

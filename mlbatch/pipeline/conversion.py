@@ -215,7 +215,7 @@ class Conversion:
             WindowPoints,
         )
 
-        slots = [sensor.source().slots for sensor in self.sensors]
+        slots = [sensor.source.slots for sensor in self.sensors]
         points = WindowPoints(self.grid, slots, self.plain_scan)
         if job.deskew == CONSTANT_VELOCITY:
             return ConstantVelocity(job.deskew_to, points, len(self.sensors))
@@ -251,7 +251,7 @@ class Conversion:
         if self._plain_decoder is None:
             # There is a window, so that the clocks are known.
             info = self._run_info()._replace(layout="dense", sort="columns")
-            sources = [sensor.source() for sensor in self.sensors]
+            sources = [sensor.source for sensor in self.sensors]
             extras = frozenset({"column"})
             self._plain_decoder = Decoder(info, sources, self.session.boxes_m, extras)
         return self._plain_decoder.scan(columns, ScanHeader(0, 0, start_ns, end_ns, True, 0))
@@ -401,7 +401,7 @@ class Conversion:
                 job.record,
             )
 
-        sources = [sensor.source() for sensor in self.sensors]
+        sources = [sensor.source for sensor in self.sensors]
         self._pool = DecodePool(
             sources,
             decoder,
@@ -520,7 +520,7 @@ class Conversion:
             where = ", ".join(map(str, self.job.recordings))
             run_report.refuse_all_removed(where, [sensor.ledger.points for sensor in self.sensors])
             points = run_report.notes_of_run(self)
-        for note in (*points, *run_report.unassigned_notes(self), *self.session.clocks.notes()):
+        for note in (*points, *run_report.unassigned_notes(self), *run_report.clock_notes(self)):
             self.warn(note)
         # A later message may be the first without receive times.
         self.session.refuse_untimed()

@@ -70,8 +70,6 @@ class DecodeWorker:
         self._sensors = len(sources)
         self._counts_clipped = counts_clipped
         if split:
-            for source in sources:
-                source.ring_base = 0
             self._decoders = [new([source], number) for number, source in enumerate(sources)]
         else:
             self._decoders = [new(sources, None)]

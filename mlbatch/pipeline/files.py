@@ -320,7 +320,7 @@ class Files:
         if self._job.max_bag_s:
             self.windows = windows_per_file(self._job.max_bag_s, run.grid.rate)
         for sensor in run.sensors:
-            sensor.ring.keep_sums()
+            sensor.source.ring.keep_sums()
         if self._earlier is None:
             return
         changed = difference(self._earlier.head.identity, self.identity)

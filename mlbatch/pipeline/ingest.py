@@ -155,7 +155,7 @@ class Ingest:
     ) -> Accepted:
         """Keep packets that may be of a sensor, and accept packets that are."""
         intake = self.intakes[sensor.index]
-        kept = sensor.ring.keep(batch.data, batch.start[index], batch.place)
+        kept = sensor.source.ring.keep(batch.data, batch.start[index], batch.place)
         host_ns = batch.host_ns[index]
         keys = None if batch.content_key is None else batch.content_key[index]
         packets = Payloads(kept.data, kept.start, keys)

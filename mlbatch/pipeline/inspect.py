@@ -42,7 +42,7 @@ from mlbatch.pipeline.contents import (
 )
 from mlbatch.pipeline.ingest import Ingest
 from mlbatch.pipeline.job import Job
-from mlbatch.pipeline.session import sensors_of
+from mlbatch.pipeline.sensor import sensors_of
 from mlbatch.readers.bag.clouds import CloudRecording
 from mlbatch.reports.json_records import to_json
 from mlbatch.reports.poses import PoseFigures

@@ -44,7 +44,7 @@ class PoseCheck:
     ) -> None:
         """slices: of a window; decode: `Conversion.plain_scan`."""
         self._sensors = sensors
-        self._slots = [sensor.source().slots for sensor in sensors]
+        self._slots = [sensor.source.slots for sensor in sensors]
         self._slices = slices
         self._decode = decode
         self._comparison: PoseComparison | None = None

@@ -8,8 +8,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from mlbatch.arrays import U8Array
+from mlbatch.clocks.compare import SYNCHRONISED, compare
 from mlbatch.clocks.host_offset import HostOffset, describe_off
 from mlbatch.clocks.timescale import describe_time
+from mlbatch.clocks.watch import ClockEstimate
 from mlbatch.discovery.discover import not_in_rig
 from mlbatch.discovery.match import describe, describe_each
 from mlbatch.discovery.sampler import MOST_KINDS
@@ -118,9 +120,30 @@ def _cloud_notes(run: Conversion) -> Iterator[Note]:
                 yield Note(CLOUDS, "", f"{recording.path.name}: {text}; {_UNMEASURED}")
 
 
+def clock_notes(run: Conversion) -> Iterator[Note]:
+    """Steps of sensor clocks and of the capture host's, clocks that differ."""
+    estimates = _estimates(run)
+    comparison = compare(estimates) if estimates else None
+    if comparison is None:
+        return
+    for name, finding in comparison.estimates:
+        for jump in finding.jumps:
+            code = "host_step" if jump.kind == "host" else "clock_jump"
+            yield Note(code, name, f"{name}: {jump.describe()}")
+    for pair in comparison.pairs:
+        if pair.verdict != SYNCHRONISED:
+            yield Note("clocks", "", pair.describe())
+
+
+def _estimates(run: Conversion) -> list[tuple[str, ClockEstimate]]:
+    """Name and clock of each sensor that gave timestamps of its own."""
+    found = ((sensor.name, sensor.clock.watch.estimate()) for sensor in run.sensors)
+    return [(name, estimate) for name, estimate in found if estimate is not None]
+
+
 def host_offsets(run: Conversion) -> list[HostOffset]:
     """Clocks of the sensors, as batched, against the capture host's; none by receive times."""
-    findings = dict(run.session.clocks.findings())
+    findings = dict(_estimates(run))
     offsets = []
     for sensor, first in zip(run.sensors, run.batcher.firsts, strict=True):
         if sensor.clock.by_host or first is None:
@@ -441,7 +464,7 @@ def _clock(run: Conversion, sensor: Sensor) -> ClockReport:
     # A clock by receive times is in none of these: it is the capture host's.
     offsets_ns = {one.sensor: one.offset_ns for one in host_offsets(run)}
     offset_ms = offsets_ns.get(sensor.name, 0) / NS_PER_MS
-    finding = dict(run.session.clocks.findings()).get(sensor.name)
+    finding = dict(_estimates(run)).get(sensor.name)
     if finding is None:
         return ClockReport(source, epoch, offset_ms, notes=notes)
     if sensor.clock.map is not None:

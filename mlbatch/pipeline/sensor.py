@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 from mlbatch.arrays import F64Array, I64Array
 from mlbatch.batching.fill import Pace
@@ -12,9 +13,12 @@ from mlbatch.clocks.timescale import timescale
 from mlbatch.clocks.watch import ClockWatch
 from mlbatch.decode.groups import Source
 from mlbatch.decode.packet_ring import PacketRing
+from mlbatch.discovery.discover import Discovery
+from mlbatch.discovery.sampler import clock_watch
 from mlbatch.discovery.types import DetectedSensor
 from mlbatch.lidar.interface import Lidar
 from mlbatch.native.arena import PacketArena
+from mlbatch.pipeline.job import Job
 from mlbatch.reports.ledger import SensorLedger
 from mlbatch.rig.rig import RigSensor
 from mlbatch.types import StreamTable
@@ -50,14 +54,6 @@ class SensorClock:
         return self.stated or timescale(host_ns if self.by_host else stamp_ns, host_ns)
 
 
-class Limits(NamedTuple):
-    """Limits within which points of a sensor are written; ranges in m."""
-
-    min_range_m: float
-    max_range_m: float
-    keep_repeated: bool
-
-
 @dataclass(slots=True)
 class Sensor:
     """A lidar of this run: its decoder, pose, clock, packets and counters."""
@@ -65,10 +61,8 @@ class Sensor:
     index: int  # `lidar_id` in outputs
     detected: DetectedSensor  # result of discovery
     clock: SensorClock
-    limits: Limits
-    ring_base: int  # first ring number of its channels
+    source: Source  # input of decoding, with its raw packets until their window closes
     columns_per_s: float | None  # nominal rate, None if unknown
-    ring: PacketRing  # raw packets until their window closes
     ledger: SensorLedger = field(default_factory=SensorLedger)
 
     @property
@@ -106,11 +100,6 @@ class Sensor:
         most = max((table.most_packets.get(stream, 0) for stream in streams), default=0)
         return max(*spans, 0, most * packet_ns if most > 1 else 0)
 
-    @property
-    def column_offsets(self) -> I64Array:
-        """Ring indexes of the columns of a packet, relative to that of the packet: (C,)."""
-        return self.ring.column_offsets(self.lidar.columns_per_packet)
-
     def intake(self, *, host_clock: bool = False) -> Intake:
         """A new intake of the batcher for this sensor; host_clock: whatever its clock is."""
         lidar = self.lidar
@@ -118,7 +107,7 @@ class Sensor:
         watches = self.clock.has_receive_times and not by_host
         return Intake(
             self.name,
-            self.column_offsets,
+            self._column_offsets,
             lidar.reader,
             host_clock=by_host,
             offset_ns=self.clock.offset_ns,
@@ -136,7 +125,7 @@ class Sensor:
         if watch is None and self.clock.has_receive_times:
             watch = self.clock.watch
         return Intake(
-            self.name, self.column_offsets, self.lidar.reader, takes_all=True, watch=watch
+            self.name, self._column_offsets, self.lidar.reader, takes_all=True, watch=watch
         )
 
     def pace(self) -> Pace:
@@ -146,23 +135,53 @@ class Sensor:
         positions = None if angles is None else len(angles)
         return Pace(lidar.columns_per_s, lidar.lit_share, positions)
 
-    def source(self) -> Source:
-        """The input of decoding for this sensor."""
-        return Source(
-            self.lidar,
-            self.ring,
-            self.body_from_sensor,
-            self.ring_base,
-            self.limits.min_range_m,
-            self.limits.max_range_m,
-            self.limits.keep_repeated,
-        )
-
     def unread(self, arena: PacketArena) -> Sensor:
         """The same sensor with an empty ring and ledger, for a pass of its own."""
-        return replace(self, ring=new_ring(self.lidar, arena), ledger=SensorLedger())
+        source = replace(self.source, ring=new_ring(self.lidar, arena))
+        return replace(self, source=source, ledger=SensorLedger())
+
+    @property
+    def _column_offsets(self) -> I64Array:
+        """Ring indexes of the columns of a packet, relative to that of the packet: (C,)."""
+        return self.source.ring.column_offsets(self.lidar.columns_per_packet)
 
 
 def new_ring(lidar: Lidar, arena: PacketArena) -> PacketRing:
     """An empty ring for packets of a lidar."""
     return PacketRing(lidar.packet_size, lidar.records, arena)
+
+
+def sensors_of(setup: Discovery, job: Job, arena: PacketArena) -> list[Sensor]:
+    """The sensors of a session with empty rings and ledgers; arena: where packets are kept."""
+    sampler = setup.sampler
+    sensors: list[Sensor] = []
+    ring_base = 0
+    for found in setup.sensors:
+        rig, lidar = found.rig, found.lidar
+        least_m, most_m = (None, None) if rig is None else (rig.min_range_m, rig.max_range_m)
+        sensors.append(
+            Sensor(
+                index=len(sensors),
+                detected=found,
+                clock=SensorClock(
+                    by_host=job.selection.host_clock or (rig is not None and rig.clock == "host"),
+                    offset_ns=found.offset_ns,
+                    has_receive_times=sampler.has_receive_times(found),
+                    watch=clock_watch(lidar),
+                    stated="" if setup.output is None else setup.output.timescale,
+                ),
+                source=Source(
+                    lidar,
+                    new_ring(lidar, arena),
+                    found.pose.body_from_sensor,
+                    0 if job.split else ring_base,
+                    # The narrower of the ranges of job and rig.
+                    max(job.min_range_m, least_m or 0.0),
+                    min(job.max_range_m, most_m or math.inf),
+                    job.keep_repeated,
+                ),
+                columns_per_s=sampler.columns_per_s(found),
+            )
+        )
+        ring_base += max(lidar.channels, int(lidar.channel.max()) + 1)
+    return sensors

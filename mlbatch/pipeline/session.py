@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import contextlib
-import math
 from collections.abc import Callable, Generator, Iterator, Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from mlbatch.arrays import BoolArray, F64Array, U8Array
+from mlbatch.arrays import BoolArray, F64Array, I64Array, U8Array
+from mlbatch.discovery.calibrations import is_metadata
 from mlbatch.discovery.discover import Discovery, discover, refuse_absent, refuse_untimed
 from mlbatch.discovery.first_seconds import is_without_packets
 from mlbatch.discovery.match import release
@@ -19,24 +20,32 @@ from mlbatch.errors import RecordingError
 from mlbatch.native import require_library
 from mlbatch.native.arena import PacketArena
 from mlbatch.outputs.inputs import open_inputs
-from mlbatch.pipeline.clock_monitor import ClockMonitor
 from mlbatch.pipeline.ingest import Ingest
 from mlbatch.pipeline.job import Job, TimeSegment
-from mlbatch.pipeline.sensor import Limits, Sensor, SensorClock, new_ring
+from mlbatch.pipeline.sensor import Sensor, sensors_of
 from mlbatch.readers.source import BUFFER_BYTES
 from mlbatch.reports.report import ACCEPTED_WARNINGS
-from mlbatch.rig.rig import Rig, RigSensor
-from mlbatch.types import PacketBatch, Recording, RunInfo, SensorInfo, StreamTable
+from mlbatch.types import (
+    Message,
+    PacketBatch,
+    Recording,
+    RunInfo,
+    SensorInfo,
+    StreamTable,
+    WrappedRecording,
+)
 from mlbatch.units import NS_PER_S
 
 if TYPE_CHECKING:
+    from mlbatch.discovery.overlap import RunOverlap
     from mlbatch.faults import FaultReplay
-    from mlbatch.pipeline.overlap import RunOverlap
 
 # A note for the user, no warning: how the times of decoded clouds were read.
 CLOUDS = "clouds"
 
 
+# Beyond all receive times, ns.
+_EVER_NS = 2**63 - 1
 # Share of the bytes of a recording.
 _MOST = 0.5
 # Packets of each sensor to read at a time, between 4 MB and 5 MB in all: each batch costs some
@@ -64,10 +73,7 @@ class Session:
         streams = StreamTable()
         opened = open_inputs(job.recordings, streams, job.selection.rig)
         if job.segment != TimeSegment():
-            # Not loaded for whole sessions.
-            from mlbatch.pipeline.segments import ClippedRecording
-
-            opened = [ClippedRecording(recording, job.segment) for recording in opened]
+            opened = [_Segment(recording, job.segment) for recording in opened]
         self.setup: Discovery = discover(opened, streams, job.selection)
         self.recordings: Sequence[Recording] = self.setup.recordings
         kinds = {kind for found in self.setup.sensors for kind in found.kinds}
@@ -81,29 +87,52 @@ class Session:
         release(self.setup.sampler, kinds & self.setup.sampler.kinds.keys())
         self.refuse_untimed()
         self.replay = self._replay()
-        self.clocks = ClockMonitor(self.sensors, self.replay)
         if job.align_clocks_to:
-            batches = self._shown(self.setup.first.whole(), progress)
-            self.clocks.align(batches, self.setup.router, job.align_clocks_to)
+            self._align_clocks(progress)
         maps_stamps = bool(job.faults or job.align_clocks_to)
         self.ingest = Ingest(
             self.setup.router,
             self.sensors,
             [sensor.intake() for sensor in self.sensors],
-            self.clocks.map_stamps if maps_stamps else None,
+            self._map_stamps if maps_stamps else None,
             self._is_ignored if job.selection.only or job.selection.ignore else None,
         )
 
-    def _shown(
-        self,
-        batches: Iterator[PacketBatch],
-        progress: Callable[[int, int, int], None] | None,
-    ) -> Iterator[PacketBatch]:
-        """The batches; each is reported."""
-        for batch in batches:
-            yield batch
+    def _map_stamps(self, sensor: Sensor, stamp_ns: I64Array, host_ns: I64Array) -> I64Array:
+        """Timestamps (P, C) of packets received at (P,) as they are to be batched.
+
+        Injected faults of clocks are added, then the maps of `--align-clocks` applied.
+        """
+        if self.replay is not None:
+            stamp_ns = stamp_ns + self.replay.shift_ns(sensor.index, host_ns)[:, None]
+        found = sensor.clock.map
+        return stamp_ns if found is None else found.apply(stamp_ns, host_ns[:, None])
+
+    def _align_clocks(self, progress: Callable[[int, int, int], None] | None) -> None:
+        """Measure the clocks over the whole session, and set the map of each sensor."""
+        from mlbatch.clocks.align import fit
+
+        # Rings and ledgers of their own: this pass reads everything once more.
+        arena = PacketArena()
+        sensors = [sensor.unread(arena) for sensor in self.sensors]
+        watches = [clock_watch(sensor.lidar) for sensor in sensors]
+        intakes = [
+            sensor.clock_intake(watch) for sensor, watch in zip(sensors, watches, strict=True)
+        ]
+        ingest = Ingest(self.setup.router, sensors, intakes, self._map_stamps)
+        for batch in self._with_faults(self.setup.first.whole()):
+            arena.keep_from(None)
+            ingest.columns(batch)
             if progress is not None:
                 progress(self.position_bytes, self.size_bytes, 0)
+        for sensor, found in zip(self.sensors, fit(watches, self.job.align_clocks_to), strict=True):
+            sensor.clock.map = found
+
+    def _with_faults(self, batches: Iterator[PacketBatch]) -> Iterator[PacketBatch]:
+        """The batches with injected faults."""
+        if self.replay is None:
+            return batches
+        return self.replay.batches(batches, self.setup.router.owners)
 
     def _is_ignored(self, kind: PacketKind, packets: U8Array) -> BoolArray:
         """Return which packets (P, size) of no sensor the user left out: (P,) bool."""
@@ -135,17 +164,14 @@ class Session:
         # Only for several recordings: it costs a sort of every batch.
         if len(self.recordings) > 1:
             # Not loaded for single recordings.
-            from mlbatch.pipeline.overlap import RunOverlap
+            from mlbatch.discovery.overlap import RunOverlap
 
             self._overlap = RunOverlap(self.recordings, self.setup)
         elif self._reads_into_arena and self.replay is None and not self.setup.first.has_all:
             self.recordings[0].use_arena(self._arena)
         seen = None if self._overlap is None else self._overlap.add
-        with contextlib.closing(self.setup.first.whole(is_without_packets, seen)) as merged:
-            batches: Iterator[PacketBatch] = merged
-            if self.replay is not None:
-                batches = self.replay.batches(batches, self.setup.router.owners)
-            for batch in batches:
+        with contextlib.closing(self.setup.first.whole(is_without_packets, seen)) as batches:
+            for batch in self._with_faults(batches):
                 self._count(batch)
                 yield batch
 
@@ -192,7 +218,9 @@ class Session:
     @property
     def boxes_m(self) -> F64Array:
         """Excluded boxes of rig and job: (k, 6), m, body frame."""
-        return excluded_boxes_m(self.job, self.setup.rig)
+        boxes_m = np.array(self.job.boxes_m, np.float64).reshape(-1, 6)
+        rig = self.setup.rig
+        return boxes_m if rig is None else np.concatenate([rig.exclude_boxes_m, boxes_m])
 
     def run_info(
         self,
@@ -213,7 +241,7 @@ class Session:
                 sensor.lidar.model,
                 sensor.lidar.channels,
                 sensor.lidar.returns,
-                0 if job.split else sensor.ring_base,
+                sensor.source.ring_base,
                 sensor.body_from_sensor,
                 sensor.lidar.has_reflectivity,
                 sensor.lidar.sensor_from_imu(),
@@ -263,47 +291,35 @@ class Session:
         self.notes.append(note)
 
 
-def sensors_of(setup: Discovery, job: Job, arena: PacketArena) -> list[Sensor]:
-    """The sensors of a session with empty rings and ledgers; arena: where packets are kept."""
-    sampler = setup.sampler
-    sensors: list[Sensor] = []
-    ring_base = 0
-    for found in setup.sensors:
-        rig = found.rig
-        lidar = found.lidar
-        sensors.append(
-            Sensor(
-                index=len(sensors),
-                detected=found,
-                clock=SensorClock(
-                    by_host=job.selection.host_clock or (rig is not None and rig.clock == "host"),
-                    offset_ns=found.offset_ns,
-                    has_receive_times=sampler.has_receive_times(found),
-                    watch=clock_watch(lidar),
-                    stated="" if setup.output is None else setup.output.timescale,
-                ),
-                limits=limits(job, rig),
-                ring_base=ring_base,
-                columns_per_s=sampler.columns_per_s(found),
-                ring=new_ring(lidar, arena),
-            )
-        )
-        ring_base += max(lidar.channels, int(lidar.channel.max()) + 1)
-    return sensors
+class _Segment(WrappedRecording):
+    """The packets and messages of a recording that were received in [begin_ns, end_ns).
 
+    Others are not counted either: they belong to another segment. Messages from before the segment
+    are given only if they describe sensors, since metadata are recorded once, at the start.
+    """
 
-def limits(job: Job, rig: RigSensor | None) -> Limits:
-    """The narrower of the job's and the rig's ranges for a sensor."""
-    min_range_m = 0.0 if rig is None else rig.min_range_m or 0.0
-    max_range_m = math.inf if rig is None else rig.max_range_m or math.inf
-    return Limits(
-        max(job.min_range_m, min_range_m), min(job.max_range_m, max_range_m), job.keep_repeated
-    )
+    __slots__ = ("_begin_ns", "_end_ns")
 
+    def __init__(self, inner: Recording, segment: TimeSegment) -> None:
+        super().__init__(inner)
+        self._begin_ns = -_EVER_NS if segment.begin_ns is None else segment.begin_ns
+        self._end_ns = _EVER_NS if segment.end_ns is None else segment.end_ns
 
-def excluded_boxes_m(job: Job, rig: Rig | None) -> F64Array:
-    """Excluded boxes of rig and job: (k, 6), m, body frame."""
-    boxes_m = np.array(job.boxes_m, np.float64).reshape(-1, 6)
-    if rig is None:
-        return boxes_m
-    return np.concatenate([rig.exclude_boxes_m, boxes_m])
+    def packets(self) -> Generator[PacketBatch, None, None]:
+        """Yield the packets of the segment, in file order; each call is a new pass."""
+        self.inner.keep = self.keep
+        self.inner.lend = self.lend
+        with contextlib.closing(self.inner.packets()) as batches:
+            for batch in batches:
+                inside = (batch.host_ns >= self._begin_ns) & (batch.host_ns < self._end_ns)
+                left_out = len(batch) - int(np.count_nonzero(inside))
+                self.inner.counts.frames -= left_out
+                self.inner.counts.datagrams -= left_out
+                clipped = batch.take(np.flatnonzero(inside)) if left_out else batch
+                clipped = replace(clipped, messages=tuple(filter(self._is_due, batch.messages)))
+                if len(clipped) or clipped.messages:
+                    yield clipped
+
+    def _is_due(self, message: Message) -> bool:
+        is_begun = message.host_ns >= self._begin_ns or is_metadata(message.topic)
+        return is_begun and message.host_ns < self._end_ns

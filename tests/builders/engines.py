@@ -10,9 +10,10 @@ import numpy as np
 from mlbatch.arrays import F64Array
 from mlbatch.decode.decoder import Decoder, ScanHeader, WindowColumns
 from mlbatch.decode.groups import Source
+from mlbatch.native.arena import PacketArena
 from mlbatch.pipeline.conversion import Conversion, SkippedWindow
 from mlbatch.pipeline.job import Job
-from mlbatch.pipeline.session import excluded_boxes_m, limits
+from mlbatch.pipeline.sensor import sensors_of
 from mlbatch.types import EXTRAS, RunInfo, Scan
 from mlbatch.units import rate_text
 from tests.reference.decoder import LiteralDecoder, check_scan
@@ -91,10 +92,10 @@ def _pair(run: Conversion, wanted: Job) -> Pair:
     assert run.info is not None
     session = run.session
     info = session.run_info(rate_text(run.grid.rate), run.info.timescale)
-    sensors = [replace(one, limits=limits(wanted, one.rig)) for one in run.sensors]
+    sensors = zip(sensors_of(session.setup, wanted, PacketArena()), run.sensors, strict=True)
     return Pair(
         info._replace(layout=wanted.layout),
-        [sensor.source() for sensor in sensors],
-        excluded_boxes_m(wanted, session.setup.rig),
+        [replace(new.source, ring=one.source.ring) for new, one in sensors],
+        np.concatenate([session.boxes_m, np.array(wanted.boxes_m).reshape(-1, 6)]),
         wanted.extras,
     )

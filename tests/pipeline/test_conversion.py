@@ -166,7 +166,7 @@ def test_memory_does_not_grow_with_the_recording(tmp_path: Path) -> None:
         folder = tmp_path / str(turns)
         one = Unit(turns=turns)
         run, _ = convert(_job(write_session(folder, one, twin(one, 222)), identity=True), None)
-        sizes.append([sensor.ring.nbytes for sensor in run.sensors])
+        sizes.append([sensor.source.ring.nbytes for sensor in run.sensors])
     assert sizes[0] == sizes[1]
 
 
