@@ -9,7 +9,9 @@ from __future__ import annotations
 from array import array
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TYPE_CHECKING, NamedTuple, TypeAlias
+
+import numpy as np
 
 from mlbatch.batching.batcher import SLACK_NS
 from mlbatch.batching.sweeps import (
@@ -24,10 +26,10 @@ from mlbatch.batching.sweeps import (
     sweeps_of,
 )
 from mlbatch.batching.windows import Window
-from mlbatch.comparison.statistics import HEAD, Distribution, SetReport, SetStatistics
+from mlbatch.comparison.statistics import SetStatistics
 from mlbatch.discovery.types import Note
 from mlbatch.errors import RecordingError
-from mlbatch.page.policies import PolicyFigures
+from mlbatch.page.policies import HEAD, Distribution, PolicyFigures
 from mlbatch.pipeline import run_report
 from mlbatch.pipeline.conversion import Conversion, Progress, sweep_cutter
 from mlbatch.pipeline.job import Job
@@ -43,23 +45,13 @@ WINDOWS = "windows (mlbatch)"
 Value: TypeAlias = str | int | float | Sequence["Value"] | Mapping[str, "Value"] | None
 
 
-@dataclass(frozen=True, slots=True)
-class SensorSweeps:
-    """The whole sweeps of a sensor; sweep_ms: median length, None without a whole sweep."""
+class SensorSweeps(NamedTuple):
+    """The whole revolutions of a sensor; revolution_ms: median length, None without a whole one."""
 
     name: str
     model: str
-    sweeps: int
-    sweep_ms: float | None
-
-    def as_json(self) -> dict[str, Value]:
-        """The sensor in the JSON document."""
-        return {
-            "name": self.name,
-            "model": self.model,
-            "revolutions": self.sweeps,
-            "revolution_ms": self.sweep_ms,
-        }
+    revolutions: int
+    revolution_ms: float | None
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,7 +74,7 @@ class Comparison:
     timeout_ms: float
     compared_s: float
     sensors: tuple[SensorSweeps, ...]
-    reports: tuple[SetReport, ...]
+    reports: tuple[PolicyFigures, ...]
     notes: tuple[Note, ...] = ()
     instant: SharedInstant | None = field(default=None, compare=False, repr=False)
 
@@ -93,8 +85,8 @@ class Comparison:
     def title(self) -> str:
         """One line on what was compared."""
         sensors = ", ".join(
-            f"{one.name} ({one.sweeps} sweeps"
-            + (")" if one.sweep_ms is None else f" of {one.sweep_ms:.1f} ms)")
+            f"{one.name} ({one.revolutions} sweeps"
+            + (")" if one.revolution_ms is None else f" of {one.revolution_ms:.1f} ms)")
             for one in self.sensors
         )
         return f"{self.compared_s:.1f} s of {sensors}; windows at {self.rate_hz} Hz; times in ms"
@@ -106,14 +98,11 @@ class Comparison:
 
     def as_json(self) -> dict[str, Value]:
         """The JSON document."""
+        keys = ("rate_hz", "period_ms", "tolerance_ms", "timeout_ms", "compared_s")
         return {
             "schema": SCHEMA,
-            "rate_hz": self.rate_hz,
-            "period_ms": self.period_ms,
-            "tolerance_ms": self.tolerance_ms,
-            "timeout_ms": self.timeout_ms,
-            "compared_s": self.compared_s,
-            "sensors": [sensor.as_json() for sensor in self.sensors],
+            **{key: getattr(self, key) for key in keys},
+            "sensors": [sensor._asdict() for sensor in self.sensors],
             "policies": [report.as_json() for report in self.reports],
         }
 
@@ -156,7 +145,7 @@ class Joiner:
         if self._finder is not None:
             self._finder.add(window)
 
-    def reports(self) -> list[SetReport]:
+    def reports(self) -> list[PolicyFigures]:
         """Figures of each policy."""
         return [
             statistics.report(self._columns, policy.waiting)
@@ -251,5 +240,5 @@ def _run(
 
 
 def _sensor_sweeps(sensor: Sensor, lengths_ns: array[int]) -> SensorSweeps:
-    median_ms = Distribution.of(lengths_ns).p50
+    median_ms = Distribution.of(np.array(lengths_ns, np.int64) / NS_PER_MS).p50
     return SensorSweeps(sensor.name, sensor.lidar.model, len(lengths_ns), median_ms)

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from mlbatch.comparison.compare import WINDOWS, Comparison, compare
-from mlbatch.comparison.statistics import SetReport
+from mlbatch.page.policies import PolicyFigures
 from mlbatch.pipeline.job import Job
 from tests.builders.phases import CASES, slug, write_case
 
@@ -32,11 +32,11 @@ def found(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Comparison]:
     }
 
 
-def _policy(found: dict[str, Comparison], case: str, policy: str) -> SetReport:
+def _policy(found: dict[str, Comparison], case: str, policy: str) -> PolicyFigures:
     return next(one for one in found[case].reports if one.name == policy)
 
 
-def _spans_ms(report: SetReport) -> tuple[float, float]:
+def _spans_ms(report: PolicyFigures) -> tuple[float, float]:
     low = report.span.min
     high = report.span.max
     assert low is not None
@@ -78,7 +78,7 @@ def test_phases_add_to_the_span(
         # 99 sweeps: the first has no known begin, the last no end; and some have no partner.
         assert 96 <= report.sets <= 97
     for sensor in found[case].sensors:
-        assert (sensor.sweeps, sensor.sweep_ms) == (97, 100.0)
+        assert (sensor.revolutions, sensor.revolution_ms) == (97, 100.0)
 
 
 def test_half_of_the_faster_turns_is_lost(found: dict[str, Comparison]) -> None:
@@ -144,18 +144,18 @@ def _losses_table(found: dict[str, Comparison]) -> str:
     return _table("what else", found, _losses)
 
 
-def _table(title: str, found: dict[str, Comparison], cell: Callable[[SetReport], str]) -> str:
+def _table(title: str, found: dict[str, Comparison], cell: Callable[[PolicyFigures], str]) -> str:
     rows = [[title, *POLICIES], ["---"] * (1 + len(POLICIES))]
     rows += [[case, *map(cell, one.reports)] for case, one in found.items()]
     return "\n".join(f"| {' | '.join(row)} |" for row in rows)
 
 
-def _span(report: SetReport) -> str:
+def _span(report: PolicyFigures) -> str:
     low, high = (f"{value:.0f}" for value in _spans_ms(report))
     return low if low == high else f"{low} to {high}"
 
 
-def _losses(report: SetReport) -> str:
+def _losses(report: PolicyFigures) -> str:
     share = 100 * report.never_used / report.columns
     parts = [
         f"{report.without_a_sensor} sets of one lidar" if report.without_a_sensor else "",

@@ -28,7 +28,6 @@ def _policy(
 ) -> PolicyFigures:
     return PolicyFigures(
         name=name,
-        sets=sets,
         without_a_sensor=1,
         stale=2,
         columns=1000,
@@ -38,6 +37,7 @@ def _policy(
         span_ms=np.full(sets, float(span_ms)),
         apart_ms=np.full(sets, float(apart_ms)),
         latency_ms=np.full(sets, float(latency_ms)),
+        lidars=np.full(sets, 2),
     )
 
 
