@@ -15,7 +15,7 @@ from typing import NamedTuple
 
 from mlbatch.errors import ExportError
 from mlbatch.ros.encoding import Wire
-from mlbatch.types import Message, RunInfo, Scan, Summary, Topic
+from mlbatch.types import RunInfo, Scan, Summary, Topic
 from mlbatch.writers.bag_metadata import METADATA, metadata_text, read_file
 from mlbatch.writers.base import ScanJob, WriterOptions, windows_per_file
 from mlbatch.writers.mcap_container import McapContainer
@@ -23,7 +23,6 @@ from mlbatch.writers.message_writer import (
     TF_STATIC,
     TF_TYPE,
     ChunkJob,
-    MessageFile,
     MessageWriter,
     PendingChunk,
     grid_of,
@@ -51,33 +50,6 @@ def write_metadata(folder: Path, stem: str, numbers: Sequence[int]) -> None:
     (folder / METADATA).write_text(text, encoding="utf-8", newline="\n")
 
 
-class BagWriter(MessageWriter):
-    """Writes a run as messages in one file or several; see `MessageWriter`."""
-
-    def __init__(self, target: Path, info: RunInfo, options: WriterOptions) -> None:
-        def open_files(folder: Path) -> MessageFile:
-            self._bag = BagFiles(folder, target.name, info, options)
-            return self._bag
-
-        super().__init__(target, info, options, Wire, open_files, folder=True)
-
-    def begin_file(self, log_ns: int) -> None:
-        """Begin the file of the window, if no message has begun it; log_ns: of the first one."""
-        self._bag.begin(log_ns)
-
-    def start_window(self, index: int) -> None:
-        """Continue with the file of a window. In order."""
-        self._bag.start(index)
-
-
-class BagPartsWriter(BagWriter):
-    """Writes a run in several files, some of which may be those of other runs."""
-
-    def skip(self, scan: Scan, sensor: int | None = None) -> ScanJob:
-        """Return the job of a scan in a file of another run: it has a place, and no message."""
-        return _SkippedJob(self, scan)
-
-
 def check_topic(topic: Topic) -> None:
     """Refuse messages of ROS 1: a player of ROS 2 bags cannot read them."""
     if topic.encoding != "cdr":
@@ -87,14 +59,11 @@ def check_topic(topic: Topic) -> None:
         )
 
 
-class BagFiles:
-    """The files of a bag, one after the other; see `message_writer.MessageFile`."""
+class BagWriter(MessageWriter):
+    """Writes a run as messages in one file or several; see `MessageWriter`."""
 
-    def __init__(self, folder: Path, stem: str, info: RunInfo, options: WriterOptions) -> None:
-        """stem: what the names of files begin with."""
-        self._folder = folder
-        self._stem = stem
-        self._info = info
+    def __init__(self, target: Path, info: RunInfo, options: WriterOptions) -> None:
+        self._stem = target.name
         self._compression = options.compression
         self._files = options.files
         # In a file; 0: all are in one.
@@ -107,17 +76,14 @@ class BagFiles:
         self._container: McapContainer | None = None
         self._unfinished: list[McapContainer] = []
         self._pending: list[PendingChunk] = []
+        super().__init__(target, info, options, folder=True)
 
-    def start(self, index: int) -> None:
-        """Continue with the file of a window; call in the order of the scans."""
+    def start_window(self, index: int) -> None:
+        """Continue with the file of a window. In order."""
         block = max(index, 0) // self._windows if self._windows else 0
         if block != self._block:
             self._end_file()
             self._block = block
-
-    def begin(self, log_ns: int) -> None:
-        """Begin the file of the window, as a message of this log time would."""
-        self._file(log_ns)
 
     def take_chunks(self) -> Sequence[PendingChunk]:
         """Return the chunks completed since the last call, and the ends of files."""
@@ -127,27 +93,31 @@ class BagFiles:
             chunks += self._container.take_chunks()
         return chunks
 
-    def send(
-        self,
-        topic: str,
-        kind: str,
-        log_ns: int,
-        message: bytes | memoryview,
-        latched: bool = False,
-        crc: int | None = None,
-    ) -> None:
-        """Append a message of type `kind`, package/Type; the first one creates the topic."""
-        container = self._file(log_ns)
-        if container is not None:
-            container.send(topic, kind, log_ns, message, latched, crc)
+    def file_at(self, log_ns: int) -> McapContainer | None:
+        """Return the file of the window, which a message of this log time may begin."""
+        if not self._is_begun:
+            self._is_begun = True
+            self._number += 1
+            if self._files is None or self._files.is_due(self._block * self._windows):
+                path = self._path(self._number)
+                self._container = McapContainer(path, self._compression, check_topic)
+                self._unfinished.append(self._container)
+                # `MessageWriter` begins the first one.
+                if self._number:
+                    transforms = static_transforms(self._info, log_ns, Wire)
+                    self._container.send(TF_STATIC, TF_TYPE, log_ns, transforms, latched=True)
+        return self._container
 
-    def forward(self, message: Message) -> None:
-        """Append a recorded message unchanged."""
-        container = self._file(message.host_ns)
-        if container is not None:
-            container.forward(message)
+    def complete(self, number: int, block: int, container: McapContainer) -> None:
+        """Complete a file once its chunks are written."""
+        # By this readers know that report and table are not in the file.
+        pieces = {"windows_per_file": str(self._windows)}
+        crc = container.finish_piece(grid_of(self._info, self._info.t_init_ns) | pieces)
+        self._unfinished.remove(container)
+        if self._files is not None:
+            self._files.made({self._path(number).name: crc}, block * self._windows)
 
-    def finish(self, summary: Summary, grid: dict[str, str]) -> None:
+    def _finish_files(self, summary: Summary, grid: dict[str, str]) -> None:
         """Complete the last file, and describe all that are here in metadata.yaml."""
         if self._windows:
             self._end_file()
@@ -159,39 +129,14 @@ class BagFiles:
         paths = map(self._path, range(self._number + 1))
         numbers = [number for number, path in enumerate(paths) if path.exists()]
         if numbers:
-            write_metadata(self._folder, self._stem, numbers)
+            write_metadata(self._output.partial, self._stem, numbers)
 
-    def abandon(self) -> None:
-        """Close the incomplete files."""
+    def _abandon_files(self) -> None:
         for container in self._unfinished:
             container.abandon()
 
-    def complete(self, number: int, block: int, container: McapContainer) -> None:
-        """Complete a file once its chunks are written."""
-        # By this readers know that report and table are not in the file.
-        pieces = {"windows_per_file": str(self._windows)}
-        crc = container.finish_piece(grid_of(self._info, self._info.t_init_ns) | pieces)
-        self._unfinished.remove(container)
-        if self._files is not None:
-            self._files.made({self._path(number).name: crc}, block * self._windows)
-
     def _path(self, number: int) -> Path:
-        return self._folder / name_of_file(self._stem, number)
-
-    def _file(self, log_ns: int) -> McapContainer | None:
-        """Return the file of the next message; None if it is not written here."""
-        if not self._is_begun:
-            self._is_begun = True
-            self._number += 1
-            if self._files is None or self._files.is_due(self._block * self._windows):
-                path = self._path(self._number)
-                self._container = McapContainer(path, self._compression, check_topic)
-                self._unfinished.append(self._container)
-                # The writer itself begins the first one.
-                if self._number:
-                    transforms = static_transforms(self._info, log_ns, Wire)
-                    self._container.send(TF_STATIC, TF_TYPE, log_ns, transforms, latched=True)
-        return self._container
+        return self._output.partial / name_of_file(self._stem, number)
 
     def _end_file(self) -> None:
         """End the file under construction: no message follows."""
@@ -204,10 +149,18 @@ class BagFiles:
         self._is_begun = False
 
 
+class BagPartsWriter(BagWriter):
+    """Writes a run in several files, some of which may be those of other runs."""
+
+    def skip(self, scan: Scan, sensor: int | None = None) -> ScanJob:
+        """Return the job of a scan in a file of another run: it has a place, and no message."""
+        return _SkippedJob(self, scan)
+
+
 class _FileEnd(NamedTuple):
     """Completes a file after its chunks; see `message_writer.PendingChunk`."""
 
-    bag: BagFiles
+    writer: BagWriter
     number: int
     block: int
     container: McapContainer
@@ -217,19 +170,18 @@ class _FileEnd(NamedTuple):
 
     def write(self) -> None:
         """Complete the file."""
-        self.bag.complete(self.number, self.block, self.container)
+        self.writer.complete(self.number, self.block, self.container)
 
 
 class _SkippedJob(ChunkJob):
     """Gives a scan of another run its place, and writes what is complete before it."""
 
-    def __init__(self, writer: BagWriter, scan: Scan) -> None:
+    def __init__(self, writer: MessageWriter, scan: Scan) -> None:
         super().__init__(writer)
         self._scan = scan
-        self._begin_file = writer.begin_file
 
     def append(self) -> None:
         self._writer.place_scan(self._scan)
         # Another run sends its message, which begins the file.
-        self._begin_file(stamp_ns(self._scan))
+        self._writer.file_at(stamp_ns(self._scan))
         super().append()

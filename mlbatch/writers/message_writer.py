@@ -101,7 +101,6 @@ class MessageFile(Protocol):
 
 
 NewWire: TypeAlias = Callable[[], Wire]
-OpenFile: TypeAlias = Callable[[Path], MessageFile]
 
 
 def extras_of(encodings: tuple[str, ...], options: WriterOptions) -> frozenset[str]:
@@ -135,12 +134,12 @@ class MessageWriter:
         target: Path,
         info: RunInfo,
         options: WriterOptions,
-        wire: NewWire,
-        opener: OpenFile,
+        opener: Callable[[Path], MessageFile] | None = None,
+        wire: NewWire = Wire,
         *,
         folder: bool = False,
     ) -> None:
-        """opener: opens the file at the path of the partial output; folder: in that folder."""
+        """opener: opens the file at the path of the partial output; None: see `file_at`."""
         # Before anything is created, as it may be refused.
         self._layout = _layout_of(options)
         _refuse_same_frames(target, info)
@@ -161,8 +160,10 @@ class MessageWriter:
         senders = (one for one in info.sensors if one.sensor_from_imu is not None)
         imu = (f"/{sensor.name}/imu" for sensor in senders)
         self._own = frozenset({TF_STATIC, *self._topics.values(), *imu})
-        with self.errors():
-            self.file = opener(self._output.partial)
+        self._file: MessageFile | None = None
+        if opener is not None:
+            with self.errors():
+                self._file = opener(self._output.partial)
 
     def write(self, scan: Scan, sensor: int | None = None) -> ScanJob:
         """Return the job that writes a scan as a PointCloud2, after messages that wait for it."""
@@ -191,7 +192,7 @@ class MessageWriter:
         output = self._output
         with self.errors():
             self._begin(summary.t_init_ns)
-            self.file.finish(summary, grid_of(self._info, summary.t_init_ns))
+            self._finish_files(summary, grid_of(self._info, summary.t_init_ns))
         output.sync()
         if last is not None:
             last(output.partial)
@@ -203,8 +204,39 @@ class MessageWriter:
 
     def abandon(self) -> None:
         """Close the file; it has no index and stays under `.partial`."""
-        self.file.abandon()
+        self._abandon_files()
         self._output.close()
+
+    # -- files --------------------------------------------------------------------------------
+
+    def file_at(self, log_ns: int) -> MessageFile | None:
+        """Return the file of a message of this log time; None: another run writes it. In order."""
+        return self._file
+
+    def take_chunks(self) -> Sequence[PendingChunk]:
+        """Return the chunks completed since the last call."""
+        return () if self._file is None else self._file.take_chunks()
+
+    def _finish_files(self, summary: Summary, grid: dict[str, str]) -> None:
+        if self._file is not None:
+            self._file.finish(summary, grid)
+
+    def _abandon_files(self) -> None:
+        if self._file is not None:
+            self._file.abandon()
+
+    def _put(
+        self,
+        topic: str,
+        kind: str,
+        log_ns: int,
+        message: bytes | memoryview,
+        latched: bool = False,
+        crc: int | None = None,
+    ) -> None:
+        file = self.file_at(log_ns)
+        if file is not None:
+            file.send(topic, kind, log_ns, message, latched, crc)
 
     # -- for the stages of jobs ---------------------------------------------------------------
 
@@ -228,7 +260,7 @@ class MessageWriter:
         self.place_scan(scan)
         with self.errors():
             topic = self._topics[sensor]
-            self.file.send(topic, "sensor_msgs/PointCloud2", stamp_ns(scan), message, crc=crc)
+            self._put(topic, "sensor_msgs/PointCloud2", stamp_ns(scan), message, crc=crc)
 
     def place_scan(self, scan: Scan) -> None:
         """Write what precedes a scan. In order."""
@@ -266,19 +298,21 @@ class MessageWriter:
                 stamps += item.stamp_ns.tolist()
         stamp_ns = min(stamps, default=0)
         transforms = static_transforms(self._info, stamp_ns, self._wire)
-        self.file.send(TF_STATIC, TF_TYPE, stamp_ns, transforms, latched=True)
+        self._put(TF_STATIC, TF_TYPE, stamp_ns, transforms, latched=True)
         for item in self._waiting:
             self._send(item)
         self._waiting.clear()
 
     def _send(self, item: ImuSamples | Message) -> None:
         if isinstance(item, Message):
-            self.file.forward(item)
+            file = self.file_at(item.host_ns)
+            if file is not None:
+                file.forward(item)
             return
         messages = self._imu[item.sensor].of(item)
         topic = f"/{self._info.sensors[item.sensor].name}/imu"
         for stamp_ns, message in zip(item.stamp_ns.tolist(), messages, strict=True):
-            self.file.send(topic, "sensor_msgs/Imu", stamp_ns, message)
+            self._put(topic, "sensor_msgs/Imu", stamp_ns, message)
 
 
 def grid_of(info: RunInfo, t_init_ns: int | None) -> dict[str, str]:
@@ -314,7 +348,7 @@ class ChunkJob(ScanJob):
     def append(self) -> None:
         """Take the chunks."""
         with self._writer.errors():
-            self._chunks = self._writer.file.take_chunks()
+            self._chunks = self._writer.take_chunks()
 
     def compress(self) -> None:
         """Compress them."""

@@ -8,10 +8,9 @@ from __future__ import annotations
 from functools import partial
 from pathlib import Path
 
-from mlbatch.ros.encoding import Wire
 from mlbatch.types import RunInfo
 from mlbatch.writers.base import ScanWriter, WriterOptions
-from mlbatch.writers.message_writer import MessageFile, MessageWriter, extras_of, record_of
+from mlbatch.writers.message_writer import MessageWriter, extras_of, record_of
 
 FORMAT = "mcap"
 SUFFIX: str | None = ".mcap"
@@ -22,11 +21,8 @@ record_layout = record_of
 
 def open_writer(target: Path, info: RunInfo, options: WriterOptions) -> ScanWriter:
     """Start an MCAP file."""
+    # Imported here, so that naming the format does not load the library.
+    from mlbatch.writers.mcap_container import McapContainer
 
-    def open_file(path: Path) -> MessageFile:
-        # Imported here, so that naming the format does not load the library.
-        from mlbatch.writers.mcap_container import McapContainer
-
-        return McapContainer(path, options.compression)
-
-    return MessageWriter(target, info, options, Wire, open_file)
+    new = partial(McapContainer, compression=options.compression)
+    return MessageWriter(target, info, options, new)

@@ -24,4 +24,4 @@ record_layout = record_of
 
 def open_writer(target: Path, info: RunInfo, options: WriterOptions) -> ScanWriter:
     """Start a ROS 1 bag."""
-    return MessageWriter(target, info, options, partial(Wire, "ros1"), Rosbag1Container)
+    return MessageWriter(target, info, options, Rosbag1Container, partial(Wire, "ros1"))
