@@ -11,7 +11,7 @@ import numpy as np
 
 from mlbatch.arrays import F32Array
 from mlbatch.outputs.damage import CheckLog, DamageError
-from mlbatch.outputs.metadata import RunMetadata, with_variants
+from mlbatch.outputs.metadata import RunMetadata
 
 # Numbers of up to 19 digits: Python refuses very long ones.
 _INDEX = re.compile(r"(-?\d{1,19}) slice (\d{1,19}) of (\d{1,19})", re.ASCII)
@@ -68,12 +68,5 @@ class ScanComments:
         """Metadata of the run; log: for words that are unknown."""
         _, _, slices = self.place()
         _, _, names = self.by_name.get("lidar_id", "").partition("from 0: ")
-        found = RunMetadata(
-            rate=self.by_name.get("rate_hz"),
-            slices=slices,
-            sensors=tuple(names.split(" ")) if names else None,
-            timescale=self.by_name.get("timescale"),
-            frame_id=self.by_name.get("frame_id"),
-            sort=self.by_name.get("sort"),
-        )
-        return with_variants(log or CheckLog(), where, found, self.by_name)
+        sensors = tuple(names.split(" ")) if names else None
+        return RunMetadata.of(log or CheckLog(), where, self.by_name, sensors, slices=slices)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
+from typing import Any
 
 from mlbatch.bounded import parse_json
 from mlbatch.outputs.damage import CheckLog
@@ -11,6 +12,13 @@ from mlbatch.types import VARIANTS
 
 # Python refuses very long numbers.
 _MOST_DIGITS = 19
+_TEXTS = ("rate_hz", "timescale", "frame_id", "sort")
+_VARIANT_WORDS = {
+    "batching": ("latest", "approximate", "collate"),
+    "batching_times": ("common", "own"),
+    "stamp": ("middle", "end"),
+    "deskew_to": ("start", "middle", "end"),
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,6 +40,24 @@ class RunMetadata:
     stamp: str | None = None
     deskew: str | None = None
     deskew_to: str | None = None
+
+    @classmethod
+    def of(
+        cls,
+        log: CheckLog,
+        where: str,
+        said: Mapping[str, str],
+        sensors: tuple[str, ...] | None = None,
+        slices: int | None = None,
+        t_init_ns: int | None = None,
+    ) -> RunMetadata:
+        """Metadata of texts by name, where there are some; unknown words are violations."""
+        texts: dict[str, Any] = {name: said[name] for name in (*_TEXTS, *VARIANTS) if name in said}
+        for name, words in _VARIANT_WORDS.items():
+            if name in texts and texts[name] not in words:
+                log.fail("metadata", f"{where} {name}", f"one of {', '.join(words)}", texts[name])
+                del texts[name]
+        return cls(texts.pop("rate_hz", None), slices, t_init_ns, sensors, **texts)
 
     @property
     def variants(self) -> tuple[tuple[str, str], ...]:
@@ -65,44 +91,18 @@ class RunMetadata:
         return found
 
 
-_VARIANT_WORDS = {
-    "batching": ("latest", "approximate", "collate"),
-    "batching_times": ("common", "own"),
-    "stamp": ("middle", "end"),
-    "deskew_to": ("start", "middle", "end"),
-}
-
-
-def with_variants(
-    log: CheckLog, where: str, own: RunMetadata, said: Mapping[str, str]
-) -> RunMetadata:
-    """Metadata with the options in `said` that change what a scan is."""
-    known = {name: said[name] for name in VARIANTS if name in said}
-    for name, words in _VARIANT_WORDS.items():
-        if name in known and known[name] not in words:
-            log.fail("metadata", f"{where} {name}", f"one of {', '.join(words)}", known[name])
-            del known[name]
-    return replace(
-        own,
-        batching=known.get("batching"),
-        batching_times=known.get("batching_times"),
-        stamp=known.get("stamp"),
-        deskew=known.get("deskew"),
-        deskew_to=known.get("deskew_to"),
-    )
-
-
 def metadata_of_grid(log: CheckLog, where: str, grid: dict[str, str]) -> RunMetadata:
     """Metadata in the metadata record mlbatch.grid of an MCAP file."""
     where = f"{where} mlbatch.grid"
-    numbers: dict[str, int | None] = {}
+    numbers: list[int | None] = []
     for key in ("slices", "t_init_ns"):
         text = grid.get(key, "")
-        numbers[key] = int(text) if text.isdecimal() and len(text) <= _MOST_DIGITS else None
+        is_number = text.isdecimal() and len(text) <= _MOST_DIGITS
+        numbers.append(int(text) if is_number else None)
         log.ok("metadata")
-        if numbers[key] is None:
+        if not is_number:
             log.fail("metadata", f"{where} {key}", "a number", text or "nothing")
-    for key in ("rate_hz", "timescale", "frame_id", "sort"):
+    for key in _TEXTS:
         if key not in grid:
             log.fail("metadata", f"{where} {key}", "a text", "nothing")
     try:
@@ -111,14 +111,5 @@ def metadata_of_grid(log: CheckLog, where: str, grid: dict[str, str]) -> RunMeta
         names = None
     if not isinstance(names, list):
         log.fail("metadata", f"{where} sensors", "a list", grid.get("sensors"))
-        names = None
-    found = RunMetadata(
-        rate=grid.get("rate_hz"),
-        slices=numbers["slices"],
-        t_init_ns=numbers["t_init_ns"],
-        sensors=None if names is None else tuple(map(str, names)),
-        timescale=grid.get("timescale"),
-        frame_id=grid.get("frame_id"),
-        sort=grid.get("sort"),
-    )
-    return with_variants(log, where, found, grid)
+        return RunMetadata.of(log, where, grid, None, *numbers)
+    return RunMetadata.of(log, where, grid, tuple(map(str, names)), *numbers)

@@ -21,7 +21,7 @@ from mlbatch.arrays import I64Array
 from mlbatch.outputs.containers import check_unpacked_size, library_errors
 from mlbatch.outputs.damage import DamageError
 from mlbatch.outputs.folders import ScanFile, ScanReader
-from mlbatch.outputs.metadata import RunMetadata, with_variants
+from mlbatch.outputs.metadata import RunMetadata
 from mlbatch.outputs.stored_scan import POINT_ARRAYS, StoredScan
 from mlbatch.types import VARIANTS
 
@@ -87,15 +87,8 @@ class NpzReader(ScanReader):
         if "sensors" in values:
             self.sensors = tuple(map(str, values["sensors"].tolist()))
         slices = values.get("slices")
-        found = RunMetadata(
-            rate=texts.get("rate_hz"),
-            slices=None if slices is None else int(cast(I64Array, slices)),
-            sensors=self.sensors or None,
-            timescale=texts.get("timescale"),
-            frame_id=texts.get("frame_id"),
-            sort=texts.get("sort"),
-        )
-        return with_variants(self.log, file.where, found, texts)
+        number = None if slices is None else int(cast(I64Array, slices))
+        return RunMetadata.of(self.log, file.where, texts, self.sensors or None, slices=number)
 
     def _fits(self, file: ScanFile, key: str, values: Values) -> bool:
         """Whether a constant has its type; a number of another type is a violation in each scan."""

@@ -13,7 +13,7 @@ from mlbatch.arrays import BoolArray, F64Array, I64Array
 from mlbatch.bounded import parse_json
 from mlbatch.errors import UsageError
 from mlbatch.outputs.damage import CheckLog, VerifyError
-from mlbatch.outputs.metadata import RunMetadata, with_variants
+from mlbatch.outputs.metadata import RunMetadata
 from mlbatch.outputs.run_files import TABLE, RunFiles
 from mlbatch.types import CLOUDS, VARIANTS
 from mlbatch.units import parse_rate
@@ -141,17 +141,17 @@ class Document:
     def metadata(self) -> RunMetadata:
         """Metadata of the run in the report."""
         names = [self.text("sensors", i, "name") for i in range(self.length("sensors"))]
-        said = {name: self.at("grid", name) for name in VARIANTS}
-        found = RunMetadata(
-            rate=self.text("grid", "rate_hz"),
+        said = {name: self.text("grid", name) for name in ("rate_hz", "sort")}
+        said |= {name: text for name in VARIANTS if isinstance(text := self.at("grid", name), str)}
+        said["timescale"] = self.text("timescale")
+        return RunMetadata.of(
+            self.log,
+            self.where,
+            {name: text for name, text in said.items() if text is not None},
+            tuple(name or "" for name in names),
             slices=self.number("grid", "slices"),
             t_init_ns=self.number("grid", "t_init_ns"),
-            sensors=tuple(name or "" for name in names),
-            timescale=self.text("timescale"),
-            sort=self.text("grid", "sort"),
         )
-        texts = {name: value for name, value in said.items() if isinstance(value, str)}
-        return with_variants(self.log, self.where, found, texts)
 
     def check_number(self, expected: int, *path: str | int) -> None:
         """Check a number of the report against the output."""
