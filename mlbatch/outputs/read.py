@@ -25,7 +25,7 @@ from mlbatch.outputs.metadata import RunMetadata, metadata_of_grid
 from mlbatch.outputs.run_files import PIECES, RunFiles, inner_texts
 from mlbatch.outputs.scan import Scan
 from mlbatch.outputs.stored_scan import POINT_ARRAYS, StoredScan
-from mlbatch.outputs.table import UNKNOWN, ScanRow, TableOfRun, read_table
+from mlbatch.outputs.table import UNKNOWN, TableOfRun, read_table
 from mlbatch.reports.report import RunReport, report_of
 from mlbatch.types import RunInfo, SensorInfo
 from mlbatch.units import NS_PER_S, parse_rate
@@ -346,11 +346,10 @@ class _Run:
 
     def start_and_points(self, index: int, part: int, sensor: int | None) -> tuple[int, int]:
         """Start (ns) of a scan, and its number of points by the table; UNKNOWN: not in it."""
-        row = None if self._table is None else self._table.number(index, part)
-        if self._table is None or row is None:
+        found = None if self._table is None else self._table.row(index, part)
+        if found is None:
             number = self._first + index * self._grid.slices + part
             return self._grid.bound(number), UNKNOWN
-        found = self._table.rows[row]
         # With `--split` that of all sensors.
         return int(found["start_ns"]), int(found["points"]) if sensor is None else UNKNOWN
 
@@ -359,7 +358,7 @@ class _Run:
         if stored.end_ns is None:
             stored.index, stored.slice, stored.end_ns = self._place(stored.start_ns)
         place = (stored.index or 0, stored.slice or 0)
-        row = None if self._table is None else self._table.row(*place, stored.sensor)
+        row = None if self._table is None else self._table.of_scan(*place, stored.sensor)
         if row is None and stored.complete is None:
             raise RecordingError(
                 f"{self._where}: {stored.where}: expected a row of scan {place[0]} slice "
@@ -369,11 +368,16 @@ class _Run:
         has_columns = stored.column_stamp_ns is not None
         absent = () if has_columns else (*(POINT_ARRAYS.keys() - arrays.keys()), *_COLUMN_ARRAYS)
         owners = _copied(stored.column_lidar_id, "u1")
-        row = row or ScanRow(
-            bool(stored.complete),
-            tuple(np.bincount(owners, minlength=len(self.sensors)).tolist()) if has_columns else (),
-            fill=() if stored.fill is None else tuple(stored.fill.tolist()),
-        )
+        if row is None:
+            counts = np.bincount(owners, minlength=len(self.sensors)).tolist()
+            row = {
+                "columns_per_sensor": tuple(counts) if has_columns else (),
+                "max_gap_ns": (),
+                "fill": _copied(stored.fill, "<f4"),
+                "ready_host_ns": 0,
+            }
+        if stored.complete is not None:
+            row["complete"] = stored.complete
         empty: dict[str, Any] = {name: np.zeros(0, kind) for name, kind in POINT_ARRAYS.items()}
         # Those that no sensor may have.
         empty |= {"reflectivity": None, "range_m": None}
@@ -383,20 +387,14 @@ class _Run:
             slice=place[1],
             start_ns=stored.start_ns,
             end_ns=stored.end_ns,
-            complete=row.complete if stored.complete is None else stored.complete,
-            ready_host_ns=row.ready_host_ns,
             xyz=_copied(stored.xyz, "<f4"),
             **{name: arrays.get(name, empty[name]) for name in POINT_ARRAYS},
             column=None if stored.column is None else _copied(stored.column, "<u4"),
             column_stamp_ns=_copied(stored.column_stamp_ns, "<i8"),
             column_lidar_id=owners,
-            columns_per_sensor=row.columns,
-            max_gap_ns=row.max_gap_ns,
-            coverage=row.coverage,
-            overlap=row.overlap,
-            fill=np.array(row.fill, np.float32),
             absent=frozenset({*absent, "ring_base"}),
             sensor="" if stored.sensor is None else self.sensors[stored.sensor],
+            **row,
         )
 
     def _info_of(self, frame_id: str, organized: bool) -> RunInfo:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -138,57 +138,41 @@ def read_table(text: str, where: str) -> Rows:
         raise RecordingError(f"{err.at(where)}: {err}; restore it, or convert again") from err
 
 
-@dataclass(slots=True)
-class ScanRow:
-    """Values of a scan in scans.csv, by sensor."""
-
-    complete: bool
-    columns: tuple[int, ...] = ()
-    max_gap_ns: tuple[int, ...] = ()
-    coverage: tuple[float, ...] = ()
-    overlap: tuple[float, ...] = ()
-    fill: tuple[float, ...] = ()
-    ready_host_ns: int = 0
-
-
-@dataclass(slots=True)
 class TableOfRun:
     """Rows of a run; sensors: names in the order of `lidar_id`."""
 
-    rows: Rows
-    sensors: tuple[str, ...]
-    _numbers: dict[tuple[int, int], int] = field(default_factory=dict)
+    def __init__(self, rows: Rows, sensors: tuple[str, ...]) -> None:
+        self.rows = rows
+        self._sensors = sensors
+        keys = zip(rows["index"].tolist(), rows["slice"].tolist(), strict=True)
+        self._numbers = {key: number for number, key in enumerate(keys)}
 
-    def __post_init__(self) -> None:
-        keys = zip(self.rows["index"].tolist(), self.rows["slice"].tolist(), strict=True)
-        self._numbers.update((key, number) for number, key in enumerate(keys))
+    def row(self, index: int, part: int) -> Any:
+        """The row of a window or slice; None if it has none."""
+        number = self._numbers.get((index, part))
+        return None if number is None else self.rows[number]
 
-    def number(self, index: int, part: int) -> int | None:
-        """Number of the row of a window or slice."""
-        return self._numbers.get((index, part))
-
-    def row(self, index: int, part: int, only: int | None = None) -> ScanRow | None:
-        """The row of a window or slice; only: the sensor of the scan with `--split`."""
-        number = self.number(index, part)
-        if number is None:
+    def of_scan(self, index: int, part: int, only: int | None) -> dict[str, Any] | None:
+        """What a row says of a scan, by the names of `Scan`; only: its sensor with `--split`."""
+        row = self.row(index, part)
+        if row is None:
             return None
-        row = self.rows[number]
 
         def of(prefix: str, *, other: float | None = None) -> tuple[Any, ...]:
             """Values of all sensors; other: that of sensors which are not in the scan."""
-            names = [prefix + sensor for sensor in self.sensors]
+            names = [prefix + sensor for sensor in self._sensors]
             known = [row[name].item() for name in names if name in (row.dtype.names or ())]
             if only is None or other is None:
                 return tuple(known)
             return tuple(value if i == only else other for i, value in enumerate(known))
 
-        return ScanRow(
-            complete=bool(row["complete"]),
-            columns=of(COLUMNS, other=0),
+        return {
+            "complete": bool(row["complete"]),
+            "columns_per_sensor": of(COLUMNS, other=0),
             # Of the window, as is fill: also of sensors that are not in this scan.
-            max_gap_ns=of("max_gap_ns_"),
-            coverage=of("coverage_", other=0.0),
-            overlap=of("overlap_", other=0.0),
-            fill=of("fill_"),
-            ready_host_ns=int(row["ready_host_ns"]),
-        )
+            "max_gap_ns": of("max_gap_ns_"),
+            "coverage": of("coverage_", other=0.0),
+            "overlap": of("overlap_", other=0.0),
+            "fill": np.array(of("fill_"), np.float32),
+            "ready_host_ns": int(row["ready_host_ns"]),
+        }

@@ -22,34 +22,58 @@ _NEARLY = 0.99
 _FAR_MS = 60_000.0
 
 
-@dataclass(frozen=True, slots=True)
 class Windows:
     """Rows of scans.csv, (n,) each; by sensor (n, s)."""
 
-    sensors: tuple[str, ...]
-    slices: int  # a window
-    index: I64Array
-    slice: I64Array
-    # Number on the grid of windows or slices.
-    step: I64Array
-    start_ns: I64Array
-    end_ns: I64Array
-    points: I64Array
-    complete: BoolArray
-    # First to last column.
-    span_ms: F64Array
-    # Receive time of the packet that closed the window, minus its end; NaN if not recorded.
-    delay_ms: F64Array
-    columns: I64Array
-    expected: I64Array
-    # (s,): `expected` is not in the table, and is the median of the windows with columns.
-    estimated: BoolArray
-    # Columns per expected column, 0 to 1.
-    fill: F64Array
-    # Longest time without a column, also of earlier windows.
-    gap_ms: F64Array
-    # NaN where the table has none.
-    coverage: F64Array
+    def __init__(self, cells: Cells, slices: int) -> None:
+        """slices: a window; TableError for another table."""
+
+        def whole(name: str, empty: int | None = None) -> I64Array:
+            """A column of integers that may be added."""
+            values = cells.integers(name, empty)
+            if (np.abs(values) > _LARGEST).any():
+                raise TableError(name, f"numbers up to {_LARGEST}", "larger ones")
+            return values
+
+        def reals(name: str) -> F64Array:
+            """A column of shares; NaN where the table has none."""
+            return cells.reals(name) if name in cells.columns else np.full(len(cells), math.nan)
+
+        self.sensors = cells.sensors
+        self.slices = slices
+        self.index = whole("index")
+        self.slice = whole("slice")
+        # Number on the grid of windows or slices.
+        self.step: I64Array = self.index * slices + self.slice
+        self.start_ns = whole("start_ns")
+        self.end_ns = whole("end_ns")
+        self.columns: I64Array = cells.by_sensor("columns_", whole).astype(np.int64)
+        missing = cells.by_sensor("missing_", reals)
+        # (s,): unknown, NaN, or empty in outputs of earlier versions.
+        self.estimated: BoolArray = np.logical_not(np.all(np.isfinite(missing), axis=0))
+        known = np.where(self.estimated, 0, missing).astype(np.int64)
+        self.expected: I64Array = self.columns + known
+        for i in np.flatnonzero(self.estimated).tolist():
+            present = self.columns[self.columns[:, i] > 0, i]
+            # The head and the tail are shorter; most windows are whole.
+            self.expected[:, i] = 0 if not len(present) else int(median(present))
+        # First to last column; empty in a scan without columns.
+        span_ns = whole("last_stamp_ns", 0) - whole("first_stamp_ns", 0)
+        self.span_ms: F64Array = span_ns / NS_PER_MS
+        # Receive time of the packet that closed the window, minus its end; NaN if not recorded.
+        has_times = "ready_host_ns" in cells.columns
+        ready_ns = whole("ready_host_ns", 0) if has_times else 0 * self.end_ns
+        delay_ms = (ready_ns - self.end_ns) / NS_PER_MS
+        self.delay_ms: F64Array = np.where(ready_ns == 0, math.nan, delay_ms)
+        self.points = whole("points")
+        self.complete = cells.flags("complete")
+        # Columns per expected column, 0 to 1.
+        fill = cells.by_sensor("fill_", reals)
+        self.fill = _fill(self.columns, self.expected, self.estimated, fill)
+        # Longest time without a column, also of earlier windows.
+        self.gap_ms: F64Array = cells.by_sensor("max_gap_ns_", whole) / NS_PER_MS
+        # NaN where the table has none.
+        self.coverage: F64Array = cells.by_sensor("coverage_", reals)
 
     def __len__(self) -> int:
         return len(self.index)
@@ -93,62 +117,9 @@ def read_windows(text: str, slices: int) -> Windows | None:
             f"scans.csv: expected up to {_LARGEST} slices, found {slices}; convert again"
         )
     try:
-        return _windows(Cells.of(text), max(1, slices))
+        return Windows(Cells.of(text), max(1, slices))
     except TableError as err:
         raise ExportError(f"{err.at('scans.csv')}: {err}; convert again") from err
-
-
-def _windows(cells: Cells, slices: int) -> Windows:
-    names = cells.sensors
-
-    def whole(name: str, empty: int | None = None) -> I64Array:
-        """A column of integers that may be added."""
-        values = cells.integers(name, empty)
-        if (np.abs(values) > _LARGEST).any():
-            raise TableError(name, f"numbers up to {_LARGEST}", "larger ones")
-        return values
-
-    def reals(name: str) -> F64Array:
-        """A column of shares; NaN where the table has none."""
-        return cells.reals(name) if name in cells.columns else np.full(len(cells), math.nan)
-
-    index = whole("index")
-    part = whole("slice")
-    start_ns = whole("start_ns")
-    end_ns = whole("end_ns")
-    columns = cells.by_sensor("columns_", whole).astype(np.int64)
-    missing = cells.by_sensor("missing_", reals)
-    # Unknown: NaN, or empty in outputs of earlier versions.
-    estimated: BoolArray = np.logical_not(np.all(np.isfinite(missing), axis=0))
-    expected = columns + np.where(estimated, 0, missing).astype(np.int64)
-    for i in np.flatnonzero(estimated).tolist():
-        present = columns[columns[:, i] > 0, i]
-        # The head and the tail are shorter; most windows are whole.
-        expected[:, i] = 0 if not len(present) else int(median(present))
-    # Empty in a scan without columns.
-    first_ns = whole("first_stamp_ns", 0)
-    last_ns = whole("last_stamp_ns", 0)
-    # 0: the packets have no receive times.
-    ready_ns = whole("ready_host_ns", 0) if "ready_host_ns" in cells.columns else 0 * end_ns
-    return Windows(
-        sensors=names,
-        slices=slices,
-        index=index,
-        slice=part,
-        step=index * slices + part,
-        start_ns=start_ns,
-        end_ns=end_ns,
-        points=whole("points"),
-        complete=cells.flags("complete"),
-        span_ms=(last_ns - first_ns) / NS_PER_MS,
-        delay_ms=np.where(ready_ns == 0, math.nan, (ready_ns - end_ns) / NS_PER_MS),
-        columns=columns,
-        expected=expected,
-        estimated=estimated,
-        fill=_fill(columns, expected, estimated, cells.by_sensor("fill_", reals)),
-        gap_ms=cells.by_sensor("max_gap_ns_", whole) / NS_PER_MS,
-        coverage=cells.by_sensor("coverage_", reals),
-    )
 
 
 def _fill(columns: I64Array, expected: I64Array, estimated: BoolArray, known: F64Array) -> F64Array:

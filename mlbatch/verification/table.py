@@ -29,43 +29,44 @@ _LATE_NS = 2**62
 _MAX_U8 = 255
 
 
-@dataclass(slots=True)
 class Table:
-    """Rows of scans.csv, (n,) int64 each; (n, s) by sensor."""
+    """Rows of scans.csv, (n,) int64 each; (n, s) by sensor. where: name of the file."""
 
-    # Name of the file.
-    where: str
-    # Names, from the head line.
-    sensors: tuple[str, ...]
-    index: I64Array
-    slice: I64Array
-    start_ns: I64Array
-    end_ns: I64Array
-    # Timestamp of the first column, and of the last.
-    first_ns: I64Array
-    last_ns: I64Array
-    points: I64Array
-    columns: I64Array
-    # (n, s)
-    columns_of: I64Array
-    # (n, s): longest time without a column.
-    gap_ns: I64Array
-    # (n, s) float64: columns present / columns expected, NaN: unknown; None in older tables.
-    fill: F64Array | None
-    # (n,): of all bytes of the scans, -1: unknown; None in older tables.
-    checksum: I64Array | None
-    # (n,) bool
-    complete: BoolArray
-    _rows: dict[tuple[int, int], int] = field(default_factory=dict)
+    def __init__(self, log: CheckLog, where: str, cells: Cells) -> None:
+        """TableError unless all columns are there."""
+        self.where = where
+        self.sensors = cells.sensors
+        by_sensor = [prefix + name for prefix in (COLUMNS, _GAP) for name in self.sensors]
+        missing = [name for name in (*_COUNTS, *by_sensor, "complete") if name not in cells.columns]
+        if missing or not self.sensors:
+            raise TableError("", f"columns {', '.join(missing) or 'of sensors'}", "none")
+        if not len(cells):
+            raise TableError("", "a line for each scan", "none")
+        self.index = cells.integers("index")
+        self.slice = cells.integers("slice")
+        self.start_ns = cells.integers("start_ns")
+        self.end_ns = cells.integers("end_ns")
+        self.first_ns = cells.integers("first_stamp_ns")
+        self.last_ns = cells.integers("last_stamp_ns")
+        self.points = cells.integers("points")
+        self.columns = cells.integers("columns")
+        self.columns_of: I64Array = cells.by_sensor(COLUMNS, cells.integers)
+        # Longest time without a column.
+        self.gap_ns: I64Array = cells.by_sensor(_GAP, cells.integers)
+        # Columns present / columns expected, NaN: unknown.
+        self.fill = _fills(log, where, cells)
+        # Of all bytes of the scans, -1: unknown; None in older tables.
+        has_checksums = _CHECKSUM in cells.columns
+        self.checksum = cells.integers(_CHECKSUM) if has_checksums else None
+        self.complete = cells.flags("complete")
+        keys = zip(self.index.tolist(), self.slice.tolist(), strict=True)
+        self._rows = {key: number for number, key in enumerate(keys)}
 
     def __len__(self) -> int:
         return len(self.index)
 
     def row(self, index: int, part: int) -> int | None:
         """Row of a window or slice."""
-        if not self._rows:
-            keys = zip(self.index.tolist(), self.slice.tolist(), strict=True)
-            self._rows.update((key, number) for number, key in enumerate(keys))
         return self._rows.get((index, part))
 
     def name(self, row: int) -> str:
@@ -76,37 +77,10 @@ class Table:
 def read_table(log: CheckLog, where: str, text: str) -> Table | None:
     """Read scans.csv; None if it is not usable, which is a violation."""
     try:
-        return _table(log, where, Cells.of(text))
+        return Table(log, where, Cells.of(text))
     except TableError as err:
         log.fail("table", err.at(where), err.expected, err.found)
         return None
-
-
-def _table(log: CheckLog, where: str, cells: Cells) -> Table:
-    sensors = cells.sensors
-    by_sensor = [prefix + name for prefix in (COLUMNS, _GAP) for name in sensors]
-    missing = [name for name in (*_COUNTS, *by_sensor, "complete") if name not in cells.columns]
-    if missing or not sensors:
-        raise TableError("", f"columns {', '.join(missing) or 'of sensors'}", "none")
-    if not len(cells):
-        raise TableError("", "a line for each scan", "none")
-    return Table(
-        where=where,
-        sensors=sensors,
-        index=cells.integers("index"),
-        slice=cells.integers("slice"),
-        start_ns=cells.integers("start_ns"),
-        end_ns=cells.integers("end_ns"),
-        first_ns=cells.integers("first_stamp_ns"),
-        last_ns=cells.integers("last_stamp_ns"),
-        points=cells.integers("points"),
-        columns=cells.integers("columns"),
-        columns_of=cells.by_sensor(COLUMNS, cells.integers),
-        gap_ns=cells.by_sensor(_GAP, cells.integers),
-        fill=_fills(log, where, cells),
-        checksum=cells.integers(_CHECKSUM) if _CHECKSUM in cells.columns else None,
-        complete=cells.flags("complete"),
-    )
 
 
 def _fills(log: CheckLog, where: str, cells: Cells) -> F64Array | None:
