@@ -304,8 +304,9 @@ def refuse_untimed(table: StreamTable, sensor: DetectedSensor, option: str) -> N
     for number in sorted(sensor.streams & table.untimed):
         raise UsageError(
             f"{option}: sensor {sensor.name}: expected the receive time of each packet, found only "
-            f"that of whole messages on {table.streams[number]}; use --clock sensor (in the rig: "
-            "clock.source) without --align-clocks, or record the packets with tcpdump"
+            f"that of whole messages on {table.streams[number]}; convert without it, by the clock "
+            "of the sensor (clock.offset_s in the rig where that is off), or record the packets "
+            "with tcpdump"
         )
 
 

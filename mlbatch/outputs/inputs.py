@@ -44,10 +44,10 @@ def open_inputs(paths: Sequence[Path], streams: StreamTable, rig: Path | None) -
 
 def _is_output(path: Path) -> bool:
     """Whether a path is an output of `convert`; folders of files have a report."""
-    has_report = path.with_name(f"{path.name}.report.json").is_file()
-    is_likely = has_report or (path.is_file() and read_head(path).startswith(_HEADS))
-    if not path.is_dir() and not is_likely:
-        return False
+    if not path.is_dir():
+        has_report = path.with_name(f"{path.name}.report.json").is_file()
+        if not has_report and not (path.is_file() and read_head(path).startswith(_HEADS)):
+            return False
     # Not loaded for captures.
     from mlbatch.outputs.run_files import RunFiles, is_output
 

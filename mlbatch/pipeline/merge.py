@@ -96,7 +96,7 @@ def _readable(path: Path) -> Iterator[None]:
 
 def read_parts(folders: Sequence[Path]) -> list[Part]:
     """The parts of one conversion, by number; UsageError unless each is there once."""
-    parts = [_read_part(folder) for folder in folders]
+    parts = [_read_part(folder if folder.name else folder.resolve()) for folder in folders]
     first = parts[0]
     count = first.account.shard.count
     for part in parts[1:]:

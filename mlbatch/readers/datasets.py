@@ -11,6 +11,8 @@ from typing import NamedTuple
 BAG_METADATA = "metadata.yaml"
 # Files and folders in a folder that are looked at.
 _LOOKED_AT = 1000
+# Folders in a folder that may be drives of a dataset.
+_MOST_FOLDERS = 3
 
 
 class DatasetFile(NamedTuple):
@@ -95,6 +97,11 @@ def found_in_folder(folder: Path) -> str:
     known = proposal(by_files(folder))
     if known:
         return f"found a folder of files; {known}"
+    folders = sorted(path for path in islice(folder.glob("*"), _LOOKED_AT) if path.is_dir())
+    for inner in folders[:_MOST_FOLDERS]:
+        known = proposal(by_files(inner))
+        if known:
+            return f"found a folder of folders; name {inner}: {known}"
     names = [path.name.lower() for path in _some_files(folder)]
     counts = [sum(name.endswith(one.suffixes) for name in names) for one in DATASET_FILES]
     most = max(counts, default=0)

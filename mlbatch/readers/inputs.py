@@ -25,7 +25,8 @@ def expand(paths: Iterable[Path]) -> tuple[Path, ...]:
 
 def _expanded(path: Path) -> Iterator[Path]:
     if path.is_dir():
-        yield from _of_folder(path)
+        # Outputs and notes name it.
+        yield from _of_folder(path.resolve() if path.name in ("", "..") else path)
     elif path.exists() or not glob.has_magic(str(path)):
         yield path
     else:

@@ -400,6 +400,14 @@ def test_mistakes(shell: Shell, words: str) -> None:
     assert MISTAKES[words] in outcome.err.splitlines()[-1]
 
 
+def test_the_folder_above_a_drive_names_the_drive(shell: Shell) -> None:
+    made.boreas()
+    (drive,) = Path().glob("boreas-*")
+    outcome = shell("inspect .")
+    name = f"found a folder of folders; name {drive.absolute()}: topics or files are those of Boreas"
+    assert name in outcome.err
+
+
 def test_the_calibration_of_two_platforms_is_not_guessed(shell: Shell) -> None:
     made.mcd()
     Path("hhs_calib.yaml").write_text(Path("atv_calib.yaml").read_text())

@@ -245,3 +245,31 @@ def test_wrong_usage_without_a_command_shows_the_help(shell: Shell) -> None:
     assert (unknown.code, unknown.out) == (2, "")
     assert len(unknown.err.splitlines()) == 1
     assert unknown.err.startswith("mlbatch: error: No such command 'convrt'")
+
+
+@pytest.mark.parametrize(
+    ("words", "code"),
+    [
+        ("inspect .", 0),
+        ("convert . -o ../again.mcap", 0),
+        ("convert .. -o ../../again.mcap", 0),
+        ("report .", 0),
+        ("verify .", 0),
+        ("digest .", 0),
+        ("diff . .", 0),
+        ("batch . -o ../sessions", 2),
+        ("compare .", 2),
+        ("extract . -o ../raw.pcap", 2),
+        ("merge . -o ../merged", 2),
+    ],
+)
+def test_the_folder_that_one_is_in(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, words: str, code: int
+) -> None:
+    shell = Shell(monkeypatch, tmp_path)
+    made = shell(f"convert {FIXTURE}/two_lidars.pcap --rig {FIXTURE}/rig.yaml -o bag -f rosbag2")
+    assert made.code == 0
+    Path("bag/inner").mkdir()
+    monkeypatch.chdir("bag/inner" if ".." in words.split() else "bag")
+    outcome = shell(words)
+    assert (outcome.code, "internal error" in outcome.err) == (code, False), outcome.err
