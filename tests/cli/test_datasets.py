@@ -404,7 +404,9 @@ def test_the_folder_above_a_drive_names_the_drive(shell: Shell) -> None:
     made.boreas()
     (drive,) = Path().glob("boreas-*")
     outcome = shell("inspect .")
-    name = f"found a folder of folders; name {drive.absolute()}: topics or files are those of Boreas"
+    name = (
+        f"found a folder of folders; name {drive.absolute()}: topics or files are those of Boreas"
+    )
     assert name in outcome.err
 
 
