@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import glob as globbing
+import os
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -244,7 +245,8 @@ def _inputs(match: str, rig_of: Callable[[], str | None]) -> tuple[str, ...]:
 
 def _named(template: str, match: str) -> str:
     """The name of a session: folder, stem (without suffixes of recordings) and name of a match."""
-    path = PurePosixPath(match.rstrip("/"))
+    # Of "." and "..", too, and of a file in the folder that one is in.
+    path = PurePosixPath(match.rstrip("/") if is_url(match) else os.path.abspath(match))
     is_folder = match.endswith("/") or (not is_url(match) and Path(match).is_dir())
     stem = path.name if is_folder else _SUFFIXES.sub("", path.name)
     folder = path.name if is_folder else path.parent.name

@@ -257,7 +257,7 @@ def test_wrong_usage_without_a_command_shows_the_help(shell: Shell) -> None:
         ("verify .", 0),
         ("digest .", 0),
         ("diff . .", 0),
-        ("batch . -o ../sessions", 2),
+        ("batch . -o ../sessions", 0),
         ("compare .", 2),
         ("extract . -o ../raw.pcap", 2),
         ("merge . -o ../merged", 2),
