@@ -173,6 +173,70 @@ def _shared(apart: int) -> list[Recorded]:
     ]
 
 
+def _two_frames(*, apart: int = 30 * MS) -> list[Recorded]:
+    one = _bag(_clouds(OUSTER, NS, frame="front"))
+    two = [
+        Recorded(
+            "/points",
+            CLOUD,
+            start + SWEEP + apart,
+            cloud_message(OUSTER, _sweep(OUSTER, NS, x=-3.0), start + apart, Form(frame="rear")),
+        )
+        for start in _starts()
+    ]
+    return [*one, *two]
+
+
+def _pair(header: int, delay: int = SWEEP) -> list[Recorded]:
+    """Two lidars; header: how much the clock of the second is ahead, ns; delay: of its log."""
+    return [
+        *_bag(_clouds(OUSTER, NS), "/one/points"),
+        *_bag(_clouds(OUSTER, NS, header=header), "/two/points", delay=delay),
+    ]
+
+
+def _late_frame() -> list[Recorded]:
+    """A second frame after the messages by which the topic is judged."""
+    starts = [STAMP_NS + number * SWEEP for number in range(30)]
+    sweep = _sweep(OUSTER, NS)
+    return [
+        Recorded(
+            "/points", CLOUD, start + SWEEP, cloud_message(OUSTER, sweep, start, Form(frame=frame))
+        )
+        for start in starts
+        for frame in (["front"] if start < starts[20] else ["front", "rear"])
+    ]
+
+
+def _custom_lidars() -> list[Recorded]:
+    """The Livox driver publishes all lidars on one topic by default."""
+    found = []
+    for start, message in zip(_starts(), _custom(), strict=True):
+        # Behind the number of points, before three reserved bytes and the points' length.
+        at = len(message) - 20 * COLUMNS + 1 - 8
+        assert message[at : at + 4] == b"\1\0\0\0"
+        for lidar in (0, 1):
+            data = message[:at] + bytes([lidar]) + message[at + 1 :]
+            found.append(Recorded("/livox/lidar", CUSTOM2, start + SWEEP + lidar, data))
+    return found
+
+
+def _stepping(step: int) -> list[Recorded]:
+    """A clock that steps after three sweeps."""
+    starts = [start + (step if number >= 3 else 0) for number, start in enumerate(_starts())]
+    return _bag([cloud_message(OUSTER, _sweep(OUSTER, NS), start) for start in starts])
+
+
+def _placed() -> list[Recorded]:
+    """One of two lidars is in a frame of the recording."""
+    edge = ("base_link", "one", (7.0, 7.0, 7.0), (0.0, 0.0, 0.0, 1.0))
+    return [
+        Recorded("/tf_static", "tf2_msgs/TFMessage", STAMP_NS, transforms_message("cdr", [edge])),
+        *_bag(_clouds(OUSTER, NS, frame="alpha"), "/one/points"),
+        *_bag(_clouds(OUSTER, NS, frame="one"), "/two/points"),
+    ]
+
+
 FLOAT = (*XYZ, ("time", "float32"))
 ABSOLUTE = (*XYZ, ("timestamp", "float64"))
 AT_END = _clouds(OUSTER, NS, header=LAST)
@@ -240,6 +304,25 @@ RECORDINGS: dict[str, list[Recorded]] = {
     "undistorted": _bag(SEEN, "/boxi/hesai/points_undistorted"),
     "rectified": _bag(SEEN, "/sensing/lidar/top/rectified/pointcloud"),
     "deskewed": _bag(SEEN, "/lidar/deskewed"),
+    # Several lidars, by their frames, numbers or topics.
+    "two_frames": _two_frames(),
+    "late_frame": _late_frame(),
+    "custom_lidars": _custom_lidars(),
+    "car": [*_bag(SEEN, "/car/points_front"), *_bag(SEEN, "/car/points_rear")],
+    "placed": _placed(),
+    # Of two lidars the second is ahead; the first counts from power-on, the second is logged at
+    # the times of its headers.
+    **{f"apart_{ms}": _pair(ms * MS) for ms in (100, 500, 37_000)},
+    "copies": [
+        *_bag(_clouds(OUSTER, NS, header=-1_699_999_500_000 * MS), "/one/points"),
+        *_pair(0, delay=0)[SWEEPS:],
+    ],
+    "forward": _stepping(3600_000 * MS),
+    "backward": _stepping(-3600_000 * MS),
+    "map": [
+        *_bag(SEEN, "/one/points"),
+        *_bag([cloud_message(XYZ, [(1, 2, 3)], start) for start in _starts()], "/map/points"),
+    ],
 }
 CASES = transcripts("clouds")
 
@@ -353,20 +436,6 @@ def test_another_field_of_rings(shell: Shell, tmp_path: Path) -> None:
 # -- several lidars on a topic ---------------------------------------------------------------------
 
 
-def _two_frames(*, apart: int = 30 * MS) -> list[Recorded]:
-    one = _bag(_clouds(OUSTER, NS, frame="front"))
-    two = [
-        Recorded(
-            "/points",
-            CLOUD,
-            start + SWEEP + apart,
-            cloud_message(OUSTER, _sweep(OUSTER, NS, x=-3.0), start + apart, Form(frame="rear")),
-        )
-        for start in _starts()
-    ]
-    return [*one, *two]
-
-
 @pytest.mark.parametrize("apart", [0, 30 * MS])
 def test_frames_separate_lidars_on_one_topic(shell: Shell, tmp_path: Path, apart: int) -> None:
     outcome = _run(shell, _two_frames(apart=apart), "--identity-extrinsics --strict")
@@ -382,44 +451,6 @@ def test_frames_separate_lidars_on_one_topic(shell: Shell, tmp_path: Path, apart
         with np.load(path) as scan:
             # Points of the first lidar are at x = 5, of the second at x = -3.
             assert ((scan["xyz"][:, 0] > 0) == (scan["lidar_id"] == 0)).all()
-
-
-def test_one_of_two_frames_can_be_named_and_ignored(shell: Shell, tmp_path: Path) -> None:
-    outcome = _run(shell, _two_frames(), "--ignore 'cloud_2_rear'")
-    assert outcome.code == 0, outcome.err
-    rig = "sensors:\n  - {name: back, stream: {topic: /points, frame_id: rear}}\n"
-    outcome = _run(shell, _two_frames(), "--strict", rig=rig)
-    assert outcome.code == 1
-    assert "leave it out with --ignore '/points (frame_id front)' (not_in_rig" in outcome.err
-    ignore = "--ignore '/points (frame_id front)'"
-    outcome = _run(shell, _two_frames(), f"--strict {ignore}", rig=rig)
-    assert outcome.code == 0, outcome.err
-    report = report_of("out/report.json")
-    assert [one["name"] for one in report["sensors"]] == ["back"]
-    (other,) = report["unassigned"]
-    assert other["stream"] == "/points (frame_id front)"
-    # Without frame_id the sensor could be either.
-    outcome = _run(shell, _two_frames(), rig=_rig())
-    assert outcome.code == 1
-    assert "expected packets of one lidar, found those of several" in outcome.err
-
-
-def test_a_frame_that_comes_late_is_not_merged(shell: Shell, tmp_path: Path) -> None:
-    """After the messages by which the topic is judged."""
-    starts = [STAMP_NS + number * SWEEP for number in range(30)]
-    sweep = _sweep(OUSTER, NS)
-    messages = [
-        Recorded(
-            "/points", CLOUD, start + SWEEP, cloud_message(OUSTER, sweep, start, Form(frame=f))
-        )
-        for start in starts
-        for f in (["front"] if start < starts[20] else ["front", "rear"])
-    ]
-    outcome = _run(shell, messages, "--identity-extrinsics")
-    assert outcome.code == 0, outcome.err
-    report = report_of("out/report.json")
-    streams = {one["stream"]: one["packets"]["read"] for one in report["sensors"]}
-    assert streams == {"/points": 30 * COLUMNS, "/points (frame_id rear)": 10 * COLUMNS}
 
 
 def test_lidar_ids_of_points_separate_lidars(shell: Shell, tmp_path: Path) -> None:
@@ -442,36 +473,6 @@ def test_lidar_ids_of_points_separate_lidars(shell: Shell, tmp_path: Path) -> No
             # Places of the sensors: 5, 15 and 35 m.
             expected = np.array([5.0, 15.0, 35.0])[scan["lidar_id"]]
             assert (scan["xyz"][:, 0] == expected).all()
-
-
-def test_a_custom_message_names_its_lidar(shell: Shell, tmp_path: Path) -> None:
-    """The Livox driver publishes all lidars on one topic unless it is told otherwise."""
-    data = []
-    for start in _starts():
-        for lidar in (0, 1):
-            message = bytearray(custom_message([(n, 1, 2, 3, 7, 0, 0) for n in NS], start, start))
-            # Behind the number of points, before three reserved bytes and the points' length.
-            at = len(message) - 20 * COLUMNS + 1 - 8
-            assert message[at : at + 4] == b"\1\0\0\0"
-            message[at] = lidar
-            data.append(Recorded("/livox/lidar", CUSTOM2, start + SWEEP + lidar, bytes(message)))
-    outcome = _run(shell, data, "--identity-extrinsics --strict")
-    assert outcome.code == 0, outcome.err
-    report = report_of("out/report.json")
-    assert [(one["stream"], one["packets"]["read"]) for one in report["sensors"]] == [
-        (f"/livox/lidar (lidar_id {lidar})", SWEEPS * COLUMNS) for lidar in (0, 1)
-    ]
-
-
-def test_sensors_in_one_namespace_have_names_of_their_own(shell: Shell, tmp_path: Path) -> None:
-    messages = [
-        *_bag(_clouds(OUSTER, NS), "/car/points_front"),
-        *_bag(_clouds(OUSTER, NS), "/car/points_rear"),
-    ]
-    outcome = _run(shell, messages, "--identity-extrinsics --strict")
-    assert outcome.code == 0, outcome.err
-    report = report_of("out/report.json")
-    assert [one["name"] for one in report["sensors"]] == ["car", "car_2"]
 
 
 # -- frames, clocks, topics left out ---------------------------------------------------------------
@@ -509,22 +510,6 @@ def test_frames_of_headers_give_extrinsics(shell: Shell, tmp_path: Path) -> None
     assert np.abs(second - (-3, 5, 2)).max() < 1e-5
 
 
-def test_a_frame_that_no_transform_has_is_named(shell: Shell) -> None:
-    transforms = transforms_message(
-        "cdr", [("base_link", "one", (7.0, 7.0, 7.0), (0.0, 0.0, 0.0, 1.0))]
-    )
-    messages = [
-        Recorded("/tf_static", "tf2_msgs/TFMessage", STAMP_NS, transforms),
-        *_bag(_clouds(OUSTER, NS, frame="alpha"), "/one/points"),
-        *_bag(_clouds(OUSTER, NS, frame="one"), "/two/points"),
-    ]
-    outcome = _run(shell, messages)
-    assert outcome.code == 1
-    assert "its points are in frame alpha, which is none of the recording's (base_link, one)" in (
-        outcome.err
-    )
-
-
 def test_offsets_of_mixed_clocks_are_written_out(shell: Shell) -> None:
     """One lidar counts from power-on, one is right; the delays of their drivers differ by 20 ms.
 
@@ -557,93 +542,3 @@ def test_offsets_of_mixed_clocks_are_written_out(shell: Shell) -> None:
     # float32 seconds are within 10 ns.
     found = {round(stamp / us) * us for stamp in _stamps(Path("out"))}
     assert found == {*_expected(20 * MS), *_expected(10 * us)}
-
-
-@pytest.mark.parametrize(("ahead", "is_warned"), [(100 * MS, False), (500 * MS, True)])
-def test_clouds_apart_by_their_log_times_are_warned_about(
-    shell: Shell, ahead: int, is_warned: bool
-) -> None:
-    """Both lidars are logged 3 ms after their last points; the clock of the second is ahead."""
-    messages = [
-        *_bag(_clouds(OUSTER, NS), "/one/points"),
-        *_bag(_clouds(OUSTER, NS, header=ahead), "/two/points"),
-    ]
-    rig = (
-        "sensors:\n  - {name: one, stream: {topic: /one/points}, points: {from: start}}\n"
-        "  - {name: two, stream: {topic: /two/points}, points: {from: start}%s}\n"
-    )
-    outcome = _run(shell, messages, "--identity-extrinsics", rig=rig % "")
-    assert outcome.code == 0, outcome.err
-    text = "the points of two are 500 ms later than those of one: their clocks"
-    assert (text in outcome.err) == is_warned
-    clock = f", clock: {{offset_s: {-ahead / 1e9}}}"
-    outcome = _run(shell, messages, "--identity-extrinsics", rig=rig % clock)
-    assert outcome.code == 0, outcome.err
-    assert "later than those" not in outcome.err
-
-
-def test_log_times_that_are_copies_show_no_offset(shell: Shell) -> None:
-    behind = -1_699_999_500 * 1000 * MS
-    messages = [
-        *_bag(_clouds(OUSTER, NS, header=behind), "/one/points"),
-        *_bag(_clouds(OUSTER, NS), "/two/points", delay=0),
-    ]
-    outcome = _run(shell, messages, "--identity-extrinsics")
-    assert outcome.code == 1
-    assert "; the log times of two do not show the offset" in outcome.err
-    assert "offset_s:" not in outcome.err
-
-
-def test_clock_errors_name_what_works(shell: Shell, tmp_path: Path) -> None:
-    late = 37 * 1000 * MS
-    messages = [
-        *_bag(_clouds(OUSTER, NS), "/one/points"),
-        *_bag(_clouds(OUSTER, NS, header=late), "/two/points"),
-    ]
-    outcome = _run(shell, messages, "--identity-extrinsics")
-    assert outcome.code == 1
-    assert "clocks of the sensors cannot be compared" in outcome.err
-    assert "--clock host" not in outcome.err
-    assert "--align-clocks" not in outcome.err
-    assert "give clock.offset_s or clock.epoch in the rig" in outcome.err
-    # Both messages are logged 3 ms after their last points, which are measured at 97 ms.
-    assert "in the rig: two clock: {offset_s: -37.000} (by log times" in outcome.err
-    rig = (
-        "sensors:\n  - {name: one, stream: {topic: /one/points}}\n"
-        "  - {name: two, stream: {topic: /two/points}, clock: {offset_s: -37}}\n"
-    )
-    outcome = _run(shell, messages, "--identity-extrinsics", rig=rig)
-    assert outcome.code == 0, outcome.err
-
-
-@pytest.mark.parametrize("step", [3600_000 * MS, -3600_000 * MS])
-def test_clock_jumps_of_clouds_name_what_works(shell: Shell, step: int) -> None:
-    starts = [start + (step if number >= 3 else 0) for number, start in enumerate(_starts())]
-    data = [cloud_message(OUSTER, _sweep(OUSTER, NS), start) for start in starts]
-    outcome = _run(shell, _bag(data))
-    assert outcome.code == 1
-    assert outcome.err.endswith("; use --on-jump split\n")
-    assert _run(shell, _bag(data), "--on-jump split").code == 0
-
-
-def test_a_topic_without_times_is_an_error_unless_ignored(shell: Shell, tmp_path: Path) -> None:
-    timeless = [cloud_message(XYZ, [(1, 2, 3)], start) for start in _starts()]
-    messages = [*_bag(_clouds(OUSTER, NS), "/one/points"), *_bag(timeless, "/map/points")]
-    outcome = _run(shell, messages)
-    assert outcome.code == 1
-    assert outcome.err == (
-        "mlbatch: error: drive.db3: /map/points: expected the time of each point in a field t, "
-        "time, timestamp, time_stamp, timestamps, offset_time or ts, found x, y, z; none of them "
-        "rises within the scan as times do: record the raw packets, or clouds with times, or leave "
-        "the topic out with --ignore /map/points\n"
-    )
-    for option in ("--ignore /map/points", "--only one"):
-        outcome = _run(shell, messages, f"--strict {option}")
-        assert outcome.code == 0, outcome.err
-        report = report_of("out/report.json")
-        assert [one["name"] for one in report["sensors"]] == ["one"]
-    outcome = _run(shell, messages, "--strict", rig=_rig(topic="/one/points"))
-    assert outcome.code == 0, outcome.err
-    # Inspection goes on, and says so.
-    text = shell("inspect drive.db3").out
-    assert "/map/points: expected the time of each point" in text

@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from mlbatch.cli import progress
-from mlbatch.cli.progress import Lines, Reporter, duration
+from mlbatch.cli.progress import Lines, Reporter
 from tests.builders.sessions import CAPTURE, REPOSITORY, RIG, Shell
 
 MB = 10**6
@@ -47,21 +47,6 @@ def test_a_line_has_stage_share_scans_and_remaining_time() -> None:
     reporter(4 * MB, 400 * MB, 7)
     # The second pass has a speed of its own: 99 times 10 s.
     assert reporter.line() == "2/2 convert: 1 %, 4.0/400.0 MB, 7 scans, 16:30 left"
-
-
-def test_scans_of_unknown_number() -> None:
-    reporter = Reporter(("verify",), "scans", _ignore, Clock())
-    reporter(5, 0)
-    assert reporter.line() == "verify: 5/? scans"
-    reporter(5, 10)
-    assert reporter.line() == "verify: 50 %, 5/10 scans, 0:00 left"
-
-
-@pytest.mark.parametrize(
-    ("seconds", "text"), [(0.4, "0:00"), (59.6, "1:00"), (3599, "59:59"), (7325, "2:02:05")]
-)
-def test_durations(seconds: float, text: str) -> None:
-    assert duration(seconds) == text
 
 
 def test_lines_come_once_a_minute(capsys: pytest.CaptureFixture[str]) -> None:

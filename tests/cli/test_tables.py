@@ -64,15 +64,6 @@ def test_pipes_get_neither_colors_nor_another_width(
     assert times.sub("", wide.out) == times.sub("", narrow.out)
 
 
-def test_a_wide_terminal_shows_the_table(monkeypatch: pytest.MonkeyPatch) -> None:
-    _at(monkeypatch, 60)
-    assert _lines(ROWS) == [
-        "name   first long head  second long head   number",
-        "left   a word or two    one                     1",
-        "right  three            four words in all      22",
-    ]
-
-
 def test_a_narrower_one_its_transpose(monkeypatch: pytest.MonkeyPatch) -> None:
     _at(monkeypatch, 40)
     rows = [
@@ -84,16 +75,6 @@ def test_a_narrower_one_its_transpose(monkeypatch: pytest.MonkeyPatch) -> None:
         "joined by              latest  windows",
         "sets without a sensor       1      300",
         "sets with a stale one      20        4",
-    ]
-
-
-def test_then_cells_are_folded_between_words(monkeypatch: pytest.MonkeyPatch) -> None:
-    _at(monkeypatch, 40)
-    rows = [("name", "text"), ("left", "one two three four five six seven eight")]
-    assert _lines(rows) == [
-        "name  text",
-        "left  one two three four five six seven",
-        "      eight",
     ]
 
 
@@ -119,11 +100,6 @@ def test_a_pipe_gets_whole_lines(monkeypatch: pytest.MonkeyPatch) -> None:
     long = "x" * 500
     assert tables.table_lines([("a", "b"), (long, "2")]) == [f"a{' ' * 499}  b", f"{long}  2"]
     assert tables.paragraph(f"a {long}\nb") == f"a {long}\\nb"
-
-
-def test_text_is_folded_between_words(monkeypatch: pytest.MonkeyPatch) -> None:
-    _at(monkeypatch, 12)
-    assert tables.paragraph("one two three four") == "one two\nthree four"
 
 
 def test_clocks_of_many_sensors_are_a_matrix(shell: Shell, tmp_path: Path) -> None:

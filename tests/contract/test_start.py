@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from pathlib import Path
 
 import pytest
@@ -10,6 +11,19 @@ from tests.builders.every_model import CASES, SOURCE, job_of, sent_by
 from tests.builders.lidar_packets import vendor_of
 from tests.builders.sessions import SMALL, Unit, write_session
 from tests.contract.tree import ROOT, modules, run_python
+
+
+def _loaded(names: Iterable[str], arguments: list[str], first: str = "typer") -> set[str]:
+    """Which of these modules a command loads, beyond those that `first` loads."""
+    printed = run_python(
+        f"import atexit, sys, {first}\n"
+        f"names = [name for name in {tuple(names)!r} if name not in sys.modules]\n"
+        "from mlbatch.cli import main\n"
+        "atexit.register(lambda: print('loaded', *[n for n in names if n in sys.modules]))\n"
+        f"sys.argv[1:] = {arguments!r}\n"
+        "main()\n"
+    )
+    return set(printed.splitlines()[-1].split()[1:])
 
 
 def test_the_command_line_spares_the_collector() -> None:
@@ -54,7 +68,7 @@ NEEDLESS = (
     *("mlbatch.writers.formats.rosbag1", "mlbatch.cli.compare"),
     *("mlbatch.cli.inspect", "mlbatch.cli.verify", "mlbatch.cli.report", "mlbatch.page.document"),
     *("mlbatch.cli.simulate", "mlbatch.simulate.recording", "mlbatch.simulate.ouster.encode"),
-    *("mlbatch.simulate.interface"),
+    "mlbatch.simulate.interface",
     *("mlbatch.cli.batch", "mlbatch.cli.convert_remote", "mlbatch.batch.task"),
     *("mlbatch.cli.digest", "mlbatch.digests.golden"),
     *("mlbatch.pipeline.deskew", "mlbatch.motion.se3", "mlbatch.pipeline.merge"),
@@ -66,9 +80,9 @@ NEEDLESS = (
 )
 
 
-@pytest.mark.parametrize("name", [name for name in NEEDLESS if name.startswith("mlbatch.")])
-def test_what_is_needless_is_there(name: str) -> None:
-    assert name.removeprefix("mlbatch.") in {module.name for module in modules()}
+def test_what_is_needless_is_there() -> None:
+    names = {name.removeprefix("mlbatch.") for name in NEEDLESS if name.startswith("mlbatch.")}
+    assert names <= {module.name for module in modules()}
 
 
 def test_a_capture_loads_only_what_it_needs(tmp_path: Path) -> None:
@@ -77,39 +91,20 @@ def test_a_capture_loads_only_what_it_needs(tmp_path: Path) -> None:
     rig.write_text(f"sensors: [{{name: front, metadata: {SMALL.serial}.json}}]\n")
     output = tmp_path / "scans.mcap"
     arguments = ["convert", str(capture), "--rig", str(rig), "-o", str(output), "--quiet"]
-    printed = run_python(
-        "import atexit, sys\n"
-        # numpy 1.26 loads numpy.ma itself, and typer 0.15 loads rich.
-        "import numpy, typer\n"
-        f"names = [name for name in {NEEDLESS!r} if name not in sys.modules]\n"
-        "from mlbatch.cli import main\n"
-        "atexit.register(lambda: print([name for name in names if name in sys.modules]))\n"
-        # Slow: it reads the metadata of all distributions.
-        "from mlbatch import entry_points\n"
-        "lookups = entry_points._entry_points.cache_info\n"
-        "atexit.register(lambda: print(lookups().misses, end=' '))\n"
-        f"sys.argv[1:] = {arguments!r}\n"
-        "main()\n"
-    )
-    assert printed.strip() == "0 []"
+    # numpy 1.26 loads numpy.ma itself, and typer 0.15 loads rich.
+    assert _loaded(NEEDLESS, arguments, "numpy, typer") == set()
     assert output.is_file()
 
 
 # -- vendors --------------------------------------------------------------------------------------
 
+VENDORS = ("hesai", "livox", "ouster", "pointcloud", "robosense", "velodyne")
+TWO, FOUR = ROOT / "fixtures" / "two_lidars", ROOT / "fixtures" / "four_makers"
+
 
 def _vendors_loaded(arguments: list[str]) -> set[str]:
     """Vendors whose plug-ins a command loads."""
-    printed = run_python(
-        "import atexit, sys\n"
-        "names = [f'mlbatch.sensors.{name}.sensor' for name in "
-        "('hesai', 'livox', 'ouster', 'pointcloud', 'robosense', 'velodyne')]\n"
-        "from mlbatch.cli import main\n"
-        "atexit.register(lambda: print('loaded', *[n for n in names if n in sys.modules]))\n"
-        f"sys.argv[1:] = {arguments!r}\n"
-        "main()\n"
-    )
-    names = printed.splitlines()[-1].split()[1:]
+    names = _loaded([f"mlbatch.sensors.{name}.sensor" for name in VENDORS], arguments)
     return {name.split(".")[2] for name in names}
 
 
@@ -135,20 +130,12 @@ def test_a_capture_of_one_vendor_loads_no_other(vendor: str, has_rig: bool, tmp_
     assert _vendors_loaded(arguments) == {vendor}
 
 
-def test_a_capture_of_ouster_and_other_programs_loads_no_other_vendor() -> None:
-    """The fixture has IMU packets and multicast DNS as well."""
-    folder = ROOT / "fixtures" / "two_lidars"
-    capture = str(folder / "two_lidars.pcap")
-    arguments = ["convert", capture, "--rig", str(folder / "rig.yaml"), "--dry-run", "--quiet"]
-    assert _vendors_loaded(arguments) == {"ouster"}
-    assert _vendors_loaded(["inspect", capture]) == {"ouster"}
-
-
-def test_a_capture_of_four_vendors_loads_all_of_them() -> None:
-    """The list above is that of plug-ins that would be loaded."""
-    folder = ROOT / "fixtures" / "four_makers"
-    (capture,) = folder.glob("*.pcap")
-    loaded = _vendors_loaded(["inspect", str(capture)])
+def test_vendors_of_fixtures() -> None:
+    """IMU packets and multicast DNS load no vendor; four vendors load all of them."""
+    capture = str(TWO / "two_lidars.pcap")
+    convert = ["convert", capture, "--rig", str(TWO / "rig.yaml"), "--dry-run", "--quiet"]
+    assert _vendors_loaded(convert) == _vendors_loaded(["inspect", capture]) == {"ouster"}
+    loaded = _vendors_loaded(["inspect", str(FOUR / "four_makers.pcap")])
     assert {"hesai", "ouster", "robosense", "velodyne"} <= loaded
 
 
@@ -164,13 +151,4 @@ OF_A_RUN = (
 
 @pytest.mark.parametrize("arguments", [["--help"], ["convert", "--help"], ["--version"]])
 def test_help_loads_nothing_of_a_run(arguments: list[str]) -> None:
-    printed = run_python(
-        "import atexit, sys\n"
-        "import typer\n"
-        f"names = [name for name in {OF_A_RUN!r} if name not in sys.modules]\n"
-        "from mlbatch.cli import main\n"
-        "atexit.register(lambda: print('loaded', *[n for n in names if n in sys.modules]))\n"
-        f"sys.argv[1:] = {arguments!r}\n"
-        "main()\n"
-    )
-    assert printed.splitlines()[-1] == "loaded"
+    assert _loaded(OF_A_RUN, arguments) == set()

@@ -239,33 +239,6 @@ def test_files_of_earlier_schemas_are_read(schema: str, npz: Path, tmp_path: Pat
 # -- the command ------------------------------------------------------------------------------
 
 
-def test_the_command_writes_and_compares(tmp_path: Path) -> None:
-    output = convert(tmp_path, "npz")
-    golden = tmp_path / "golden.json"
-    assert command("digest", output, "-o", golden).out == f"wrote {golden}\n"
-    printed = command("digest", output)
-    assert (printed.code, printed.out) == (0, golden.read_text(encoding="utf-8"))
-    same = command("digest", output, "--against", golden)
-    assert (same.code, same.out, same.err) == (0, f"{output}: as described in {golden}\n", "")
-    refused = command("digest", output, "-o", golden)
-    assert refused.code == 1
-    assert "--overwrite" in refused.err
-    assert command("digest", output, "-o", golden, "--overwrite").code == 0
-
-
-def test_the_command_lists_differences(tmp_path: Path) -> None:
-    golden = tmp_path / "golden.json"
-    command("digest", convert(tmp_path / "a", "npz"), "-o", golden)
-    moved = convert(tmp_path / "b", "npz", rig=other_rig(tmp_path, MOVED))
-    found = command("digest", moved, "--against", golden)
-    assert found.code == 1
-    lines = found.out.splitlines()
-    expected = "run.sensors[0].body_from_sensor[1][3]: expected 0.95, found 0.9501 (+0.0001)"
-    assert lines[0] == expected
-    assert len(found.err.splitlines()) == 1
-    assert str(golden) in found.err
-
-
 @pytest.mark.parametrize("text", ["", "[]", "{", '{"schema": "mlbatch.report/1"}', "null"])
 def test_another_file_is_no_golden_file(text: str, tmp_path: Path) -> None:
     path = tmp_path / "golden.json"
@@ -285,18 +258,3 @@ def test_any_json_in_a_golden_file_is_a_difference(tmp_path: Path) -> None:
     for scans in several:
         broken = json.loads(json.dumps({"schema": golden["schema"], "scans": scans}))
         assert not compare(broken, golden).ok
-
-
-@pytest.mark.parametrize(
-    ("options", "code"),
-    [
-        (("--against", "golden.json", "-o", "new.json"), 2),
-        (("--against", "nothing.json"), 1),
-        (("-o", "nowhere/golden.json"), 1),
-    ],
-)
-def test_wrong_options_are_one_line(options: tuple[str, ...], code: int, tmp_path: Path) -> None:
-    found = command("digest", tmp_path / "nothing", *options)
-    assert (found.code, found.out) == (code, "")
-    assert len(found.err.splitlines()) == 1
-    assert "expected" in found.err

@@ -6,12 +6,15 @@ import importlib.metadata
 import json
 import math
 import os
+import re
 import shutil
 import struct
 import subprocess
 import sys
+from collections.abc import Callable
 from importlib.machinery import PathFinder
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -136,19 +139,18 @@ def test_the_example_installed(tmp_path: Path) -> None:
     _check_conversion(site, tmp_path)
 
 
-def test_the_example_is_converted(site: Path, tmp_path: Path) -> None:
+def test_the_example_is_listed_and_verified(site: Path, tmp_path: Path) -> None:
     write_framelog(tmp_path / "drive.flog")
-    arguments = ["convert", "drive.flog", "-o", "scans.mcap"]
-    assert _run(site, tmp_path, *arguments).returncode == 0
-    assert "violated" not in _run(site, tmp_path, "verify", "scans.mcap").stdout
-
-
-def test_the_example_is_listed(site: Path, tmp_path: Path) -> None:
-    assert "Example-4" in _run(site, tmp_path, "sensors").stdout
-    write_framelog(tmp_path / "drive.flog")
-    assert "Example-4" in _run(site, tmp_path, "inspect", "drive.flog").stdout
-    done = _run(site, tmp_path, "convert", "drive.flog", "-o", "x", "--format", "none")
-    assert "rawf32" in done.stderr
+    for words, text in (
+        ("sensors", "Example-4"),
+        ("inspect drive.flog", "Example-4"),
+        ("convert drive.flog -o x --format none", "rawf32"),
+        ("convert drive.flog -o scans.mcap", "wrote scans.mcap"),
+        ("verify scans.mcap", "ok"),
+    ):
+        done = _run(site, tmp_path, *words.split())
+        assert text in done.stdout + done.stderr, words
+        assert (done.returncode == 0) == (text != "rawf32")
 
 
 def test_the_page_names_the_modules_of_the_example() -> None:
@@ -184,44 +186,57 @@ def _nothing_remains() -> object:
     format_names.cache_clear()
 
 
-def test_a_plugin_that_cannot_be_imported(other: Path) -> None:
-    (other / "broken_reader.py").write_text("import no_such_module\n")
-    _distribution(other, "broken", entry_points.READERS, "odd = broken_reader")
-    expected = (
-        "mlbatch.readers odd of broken: expected to import broken_reader, found "
-        "ModuleNotFoundError: No module named 'no_such_module'; correct, update or uninstall"
-    )
-    with pytest.raises(UsageError, match=expected):
-        readers.readers()
+ODD = "FORMAT = 'even'\nSUFFIX = None\nCOMPRESSES = False\nextras = open_writer = print\n"
+# Modules; distributions with a group and a line; what asks for plug-ins; the error.
+MISTAKES: list[tuple[dict[str, str], list[tuple[str, str, str]], Callable[[], object], str]] = [
+    (
+        {"broken": "import no_such_module\n"},
+        [("dist", entry_points.READERS, "odd = broken")],
+        readers.readers,
+        "mlbatch.readers odd of dist: expected to import broken, found ModuleNotFoundError: No "
+        "module named 'no_such_module'; correct, update or uninstall",
+    ),
+    (
+        {"half_sensor": "VENDOR = 'Half'\nMODELS = ()\nBUILT_IN = ()\n"},
+        [("dist", entry_points.SENSORS, "half = half_sensor")],
+        sensors.plugins,
+        "in half_sensor, found no read_calibration, describe; ",
+    ),
+    (
+        {},
+        [("dist", entry_points.WRITERS, "npz = json")],
+        format_names,
+        "npz of dist: expected a name of its own",
+    ),
+    (
+        {},
+        [(name, entry_points.WRITERS, f"same = {name}_writer") for name in ("one", "two")],
+        format_names,
+        "one plug-in of this name, found those of one and two;",
+    ),
+    (
+        {"odd_writer": ODD},
+        [("dist", entry_points.WRITERS, "odd = odd_writer")],
+        lambda: writers.plugin("odd"),
+        "odd of dist: expected FORMAT 'odd', found 'even'",
+    ),
+]
 
 
-def test_a_plugin_without_a_part(other: Path) -> None:
-    (other / "half_sensor.py").write_text("VENDOR = 'Half'\nMODELS = ()\nBUILT_IN = ()\n")
-    _distribution(other, "half", entry_points.SENSORS, "half = half_sensor")
-    with pytest.raises(UsageError, match="in half_sensor, found no read_calibration, describe; "):
-        sensors.plugins()
-
-
-def test_the_name_of_a_built_in_plugin(other: Path) -> None:
-    _distribution(other, "taken", entry_points.WRITERS, "npz = json")
-    with pytest.raises(UsageError, match="npz of taken: expected a name of its own"):
-        format_names()
-
-
-def test_two_plugins_of_one_name(other: Path) -> None:
-    _distribution(other, "one", entry_points.WRITERS, "same = one_writer")
-    _distribution(other, "two", entry_points.WRITERS, "same = two_writer")
-    with pytest.raises(UsageError, match="one plug-in of this name, found those of one and two;"):
-        format_names()
-
-
-def test_a_writer_of_another_format(other: Path) -> None:
-    (other / "odd_writer.py").write_text(
-        "FORMAT = 'even'\nSUFFIX = None\nCOMPRESSES = False\nextras = open_writer = print\n"
-    )
-    _distribution(other, "odd", entry_points.WRITERS, "odd = odd_writer")
-    with pytest.raises(UsageError, match="odd of odd: expected FORMAT 'odd', found 'even'"):
-        writers.plugin("odd")
+@pytest.mark.parametrize(("texts", "distributions", "ask", "message"), MISTAKES)
+def test_mistakes(
+    texts: dict[str, str],
+    distributions: list[tuple[str, str, str]],
+    ask: Callable[[], object],
+    message: str,
+    other: Path,
+) -> None:
+    for name, text in texts.items():
+        (other / f"{name}.py").write_text(text)
+    for name, group, line in distributions:
+        _distribution(other, name, group, line)
+    with pytest.raises(UsageError, match=re.escape(message)):
+        ask()
 
 
 def test_nothing_is_looked_up_where_a_built_in_plugin_fits(other: Path) -> None:
@@ -238,77 +253,46 @@ def test_nothing_is_looked_up_where_a_built_in_plugin_fits(other: Path) -> None:
 # -- the quick search -----------------------------------------------------------------------------
 
 
-class _Lookups:
-    """Counts uses of `importlib.metadata`."""
+class _Finder:
+    def find_spec(self, *_: object) -> None:
+        return None
 
-    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        self.groups: list[str] = []
-        monkeypatch.setattr(importlib.metadata, "entry_points", self._entry_points)
-
-    def _entry_points(self, group: str) -> list[importlib.metadata.EntryPoint]:
-        self.groups.append(group)
+    def find_distributions(self, *_: object) -> list[object]:
         return []
 
 
-def _leave_out_finders(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Search without the finders that libraries of other tests may have added."""
-    finders = [
-        finder
-        for finder in sys.meta_path
-        if finder is PathFinder or not hasattr(finder, "find_distributions")
-    ]
-    monkeypatch.setattr(sys, "meta_path", finders)
+# What is on the path, and the groups that are looked up in the metadata of all distributions.
+SEARCHES = {
+    "plug-ins of others": ("unrelated.dist-info/entry_points.txt", "mlbatch.sensors_of_others", []),
+    "a plug-in": ("own.egg-info/entry_points.txt", "mlbatch.sensors", [entry_points.SENSORS]),
+    "a zip": ("packages.zip", "", [entry_points.READERS, entry_points.SENSORS]),
+    "an egg": ("thing-1.egg", "", [entry_points.READERS, entry_points.SENSORS]),
+    "another finder": ("", "", [entry_points.READERS, entry_points.SENSORS]),
+}
 
 
-def test_metadata_are_not_read_without_plugins(
-    other: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    _leave_out_finders(monkeypatch)
-    _distribution(other, "unrelated", "mlbatch.sensors_of_others", "x = y")
-    monkeypatch.setattr(sys, "path", [str(other), "", str(other / "missing")])
-    lookups = _Lookups(monkeypatch)
-    assert entry_points.names(entry_points.SENSORS) == ()
-    assert lookups.groups == []
-
-
-def test_metadata_are_read_where_one_distribution_has_plugins(
-    other: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    _leave_out_finders(monkeypatch)
-    about = other / "own.egg-info"
-    about.mkdir()
-    (about / "entry_points.txt").write_text("[mlbatch.sensors]\nx = y\n")
-    monkeypatch.setattr(sys, "path", [str(other)])
-    lookups = _Lookups(monkeypatch)
-    entry_points.names(entry_points.READERS)
-    assert lookups.groups == []
-    entry_points.names(entry_points.SENSORS)
-    assert lookups.groups == [entry_points.SENSORS]
-
-
-@pytest.mark.parametrize("name", ["packages.zip", "thing-1.egg"])
-def test_metadata_are_read_where_archives_are_on_the_path(
+@pytest.mark.parametrize("name", SEARCHES)
+def test_metadata_are_read_where_they_may_have_plugins(
     name: str, other: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    (other / name).write_bytes(b"PK")
-    monkeypatch.setattr(sys, "path", [str(other / name)])
-    lookups = _Lookups(monkeypatch)
-    entry_points.names(entry_points.WRITERS)
-    assert lookups.groups == [entry_points.WRITERS]
+    file, group, expected = SEARCHES[name]
+    # Libraries of other tests may have added finders.
+    finders: list[Any] = [one for one in sys.meta_path if one is PathFinder]
+    finders += [one for one in sys.meta_path if not hasattr(one, "find_distributions")]
+    monkeypatch.setattr(sys, "meta_path", [*finders, *([] if file else [_Finder()])])
+    if file:
+        (other / file).parent.mkdir(exist_ok=True)
+        (other / file).write_text(f"[{group}]\nx = y\n")
+    is_archive = file.endswith((".zip", ".egg"))
+    place = str(other / file) if is_archive else str(other)
+    monkeypatch.setattr(sys, "path", [place, "", str(other / "missing")])
+    lookups: list[str] = []
 
+    def looked_up(group: str) -> list[importlib.metadata.EntryPoint]:
+        lookups.append(group)
+        return []
 
-def test_metadata_are_read_where_another_finder_has_distributions(
-    other: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    class Finder:
-        def find_spec(self, *_: object) -> None:
-            return None
-
-        def find_distributions(self, *_: object) -> list[object]:
-            return []
-
-    monkeypatch.setattr(sys, "path", [str(other)])
-    monkeypatch.setattr(sys, "meta_path", [*sys.meta_path, Finder()])
-    lookups = _Lookups(monkeypatch)
-    entry_points.names(entry_points.WRITERS)
-    assert lookups.groups == [entry_points.WRITERS]
+    monkeypatch.setattr(importlib.metadata, "entry_points", looked_up)
+    for asked in (entry_points.READERS, entry_points.SENSORS):
+        assert entry_points.names(asked) == ()
+    assert lookups == expected

@@ -18,7 +18,7 @@ from mlbatch.rig.rig import read_rig
 from mlbatch.ros.messages import decode_transforms
 from mlbatch.types import StreamTable, Topic
 from tests.builders.bags import Recorded, found_in, packet_message
-from tests.builders.rosbag2 import Form, write_folder, write_rosbag2
+from tests.builders.rosbag2 import write_folder, write_rosbag2
 from tests.builders.run import command
 from tests.fuzz import packets
 from tests.fuzz.framing import Part, joined
@@ -167,24 +167,6 @@ def test_a_database_may_not_compute_its_messages(tmp_path: Path) -> None:
         connection.close()
         with pytest.raises(RecordingError, match="is computed"):
             open_recording(path, StreamTable())
-
-
-@pytest.mark.parametrize(
-    ("old", "new"),
-    [
-        ("topic_type TEXT", "topic_kind TEXT"),
-        ("name TEXT", "nome TEXT"),
-        ("id INTEGER", "ib INTEGER"),
-    ],
-)
-def test_tables_without_their_columns_are_no_bag(old: str, new: str, tmp_path: Path) -> None:
-    message = Recorded("/a/lidar_packets", OUSTER, 10**18, packet_message("cdr", bytes(100)))
-    path = write_rosbag2(tmp_path / "a.db3", [message], Form(schema=4))
-    data = path.read_bytes()
-    assert old.encode() in data
-    path.write_bytes(data.replace(old.encode(), new.encode()))
-    with pytest.raises(RecordingError, match="expected a ROS 2 bag"):
-        open_recording(path, StreamTable())
 
 
 # -- texts ----------------------------------------------------------------------------------------

@@ -16,7 +16,6 @@ from mlbatch.outputs.stored_scan import COLUMN_NS
 from mlbatch.verification import CHECKS, verify
 from tests.builders.every_model import hesai, job_of, robosense, sent_by, velodyne
 from tests.builders.run import ROOT, command
-from tests.golden.test_bag_sessions import SESSIONS
 
 SUFFIX = {"mcap": ".mcap", "rosbag1": ".bag"}
 # Checks with values in each format, of merged scans at the standard layout.
@@ -70,16 +69,3 @@ def test_odd_lidars_are_clean(name: str, tmp_path: Path) -> None:
         verdict = verify(target)
         assert verdict.ok, verdict.violations
         assert verdict.points > 0
-
-
-def test_recorded_messages_are_counted(tmp_path: Path) -> None:
-    session = SESSIONS["MCAP"](tmp_path)
-    for name in ("scans.mcap", "scans.bag"):
-        words = ("--pass", "*metadata", "--quiet")
-        run = command("convert", session, "-o", tmp_path / name, *words)
-        assert run.code == 0, run.err
-        verdict = verify(tmp_path / name)
-        assert verdict.ok, verdict.violations
-        checked = {check.name: check.checked for check in verdict.checks}
-        assert checked["messages"] > 0
-        assert checked["imu"] > 0

@@ -285,13 +285,6 @@ def test_errors_of_files_without_text(tmp_path: Path) -> None:
     )
 
 
-@pytest.mark.parametrize("text", ["[" * 100_000, "- " * 10_000, "{a: " * 10_000])
-def test_deep_nesting_ends_in_an_error(tmp_path: Path, text: str) -> None:
-    message = _fault(tmp_path, text)
-    assert "expected at most 16 levels, found more" in message
-    assert "\n" not in message
-
-
 @given(st.text(max_size=60), st.integers(min_value=0, max_value=len(VALID)))
 def test_any_text_is_read_or_refused_in_one_line(
     tmp_path_factory: pytest.TempPathFactory, text: str, position: int

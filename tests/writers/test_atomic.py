@@ -9,7 +9,7 @@ import pytest
 
 from mlbatch.errors import ExportError
 from mlbatch.writers import open_writer
-from mlbatch.writers.atomic import check_free_space, prepare
+from mlbatch.writers.atomic import prepare
 from mlbatch.writers.base import WriterOptions
 from tests.builders.scans import SUMMARY, dense_scan, run_info, run_job
 
@@ -21,15 +21,6 @@ def test_a_full_disk_names_a_remedy(tmp_path: Path) -> None:
     os.symlink("/dev/full", tmp_path / "out.partial" / "000000.npz")
     with pytest.raises(ExportError, match=r"found 'No space left on device'; free space"):
         run_job(writer.write(dense_scan()))
-
-
-@pytest.mark.parametrize("stranger", ["notes.txt", "left/photo.jpg", ".git/config"])
-def test_a_folder_with_other_files_is_never_replaced(stranger: str, tmp_path: Path) -> None:
-    (tmp_path / "out" / stranger).parent.mkdir(parents=True)
-    (tmp_path / "out" / stranger).write_text("mine")
-    with pytest.raises(ExportError, match=Path(stranger).name):
-        prepare(tmp_path / "out", overwrite=True, folder=True)
-    assert (tmp_path / "out" / stranger).read_text() == "mine"
 
 
 def test_a_recorded_bag_is_never_replaced(tmp_path: Path) -> None:
@@ -78,25 +69,3 @@ def test_an_output_that_appeared_meanwhile_is_kept(tmp_path: Path) -> None:
     with pytest.raises(ExportError, match="existing"):
         writer.finish(SUMMARY)
     assert (tmp_path / "out.mcap").read_text() == "other run"
-
-
-@pytest.mark.parametrize(
-    ("target", "words"),
-    [
-        *(("missing/out", "mkdir -p"), ("file/out", "mkdir -p")),
-        *(("..", "add a name"), ("/", "add a name"), (".", "add a name")),
-    ],
-)
-def test_places_that_are_none_are_named(
-    target: str, words: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    Path("file").touch()
-    with pytest.raises(ExportError, match=words):
-        prepare(Path(target), overwrite=True, folder=True)
-
-
-def test_too_little_free_disk_is_refused(tmp_path: Path) -> None:
-    check_free_space(tmp_path / "out", 1)
-    with pytest.raises(ExportError, match="expected about 1000000000000 MB of free disk"):
-        check_free_space(tmp_path / "out", 10**18)

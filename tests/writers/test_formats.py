@@ -126,12 +126,6 @@ def test_an_existing_output_is_refused(name: str, tmp_path: Path) -> None:
 
 
 @each_format
-def test_checking_a_target_leaves_nothing(name: str, tmp_path: Path) -> None:
-    check_target(name, tmp_path / OUTPUTS[name], WriterOptions(split=True), "dense")
-    assert not list(tmp_path.iterdir())
-
-
-@each_format
 def test_overwriting_happens_at_the_end(name: str, tmp_path: Path) -> None:
     target = tmp_path / OUTPUTS[name]
     for scans in ((0, 1, 2), (7,)):

@@ -178,33 +178,9 @@ def test_one_point_of_las_by_hand(name: str, tmp_path: Path) -> None:
 # -- all points -----------------------------------------------------------------------------------
 
 
-def _rows(folder: Path, number: int) -> Fields:
-    rows = np.fromfile(folder / f"{number:06}.bin", np.float32).reshape(-1, 4)
-    return {"xyz": rows[:, :3], "intensity": rows[:, 3]}
-
-
-def _sweep(folder: Path, number: int) -> Fields:
-    """As nuscenes-devkit reads one: LidarPointCloud.from_file."""
-    points = np.fromfile(folder / f"{number:06}.pcd.bin", np.float32).reshape(-1, 5)
-    times = np.fromfile(folder / f"{number:06}.time.bin", np.float32).reshape(-1, 2)
-    fields = {"xyz": points[:, :3], "intensity": points[:, 3], "ring": points[:, 4]}
-    return {**fields, "time": times[:, 0], "lidar_id": times[:, 1]}
-
-
 def _npz(folder: Path, number: int) -> Fields:
     with np.load(folder / f"{number:06}.npz", allow_pickle=False) as loaded:
         return {key: loaded[key] for key in loaded.files}
-
-
-def _tar(folder: Path, number: int) -> Fields:
-    with tarfile.open(folder / "000000.tar") as shard:
-        npz, about = (shard.extractfile(f"{number:06}.{suffix}") for suffix in ("npz", "json"))
-        assert npz is not None
-        assert about is not None
-        with np.load(io.BytesIO(npz.read()), allow_pickle=False) as loaded:
-            fields = {key: loaded[key] for key in loaded.files}
-        assert json.load(about)["points"] == len(fields["xyz"])
-    return fields
 
 
 def _pypcd4(folder: Path, number: int) -> Fields:
@@ -242,10 +218,6 @@ def _laspy(suffix: str) -> Callable[[Path, int], Fields]:
 
 
 READ: Mapping[str, Callable[[Path, int], Fields]] = {
-    "kitti": _rows,
-    "nuscenes": _sweep,
-    "npz": _npz,
-    "webdataset": _tar,
     "pcd": _pypcd4,
     "ply": _trimesh,
     "cloudcompare": _trimesh,
@@ -255,8 +227,6 @@ READ: Mapping[str, Callable[[Path, int], Fields]] = {
 }
 # Besides x, y, z: all that have their types have all values.
 FIELDS = {
-    "kitti": {"intensity"},
-    "nuscenes": {"intensity", "ring", "time", "lidar_id"},
     "float": {"time"},
     **{name: {"intensity", "time", *LABELS} for name in ("pcd", "ply", "cloudcompare")},
     **{name: {"intensity", "time_ns", "reflectivity", *LABELS} for name in ("las", "laz")},
@@ -276,7 +246,7 @@ def test_other_programs_read_all_points(name: str, tmp_path: Path) -> None:
         # The unit of LAS is 0.1 mm.
         tolerance = 0.5001e-4 if name in ("las", "laz") else 0.0
         np.testing.assert_allclose(fields.pop("xyz"), scan.xyz, rtol=0, atol=tolerance)
-        assert name in ("npz", "webdataset") or set(fields) == FIELDS[name]
+        assert set(fields) == FIELDS[name]
         for field in ("intensity", "time_ns", "reflectivity", *LABELS):
             if field in fields:
                 np.testing.assert_array_equal(fields[field], getattr(scan, field))
@@ -284,15 +254,6 @@ def test_other_programs_read_all_points(name: str, tmp_path: Path) -> None:
             late_s = scan.time_ns / 1e9 - fields["time"]
             # A float32 of up to 0.125 s, rounded toward zero.
             assert 0 <= late_s.min() <= late_s.max() < 2**-27
-
-
-def test_laz_has_the_points_of_las_in_fewer_bytes(tmp_path: Path) -> None:
-    scan = dense_scan(points=60_000)
-    plain = written(tmp_path / "las", "las", scan) / "000000.las"
-    small = written(tmp_path / "laz", "laz", scan) / "000000.laz"
-    # Random values; real scans are compressed to a sixth.
-    assert small.stat().st_size < plain.stat().st_size / 2
-    np.testing.assert_array_equal(laspy.read(plain).points.array, laspy.read(small).points.array)
 
 
 def test_organized_scans_have_a_row_for_each_slot(tmp_path: Path) -> None:
