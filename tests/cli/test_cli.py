@@ -16,9 +16,6 @@ import pytest
 
 from tests.builders.sessions import CAPTURE, FIX, REPOSITORY, RIG, Report, Shell, names, report_of
 
-# Points of a window: fixtures/two_lidars/SOURCE.md.
-POINTS = 27998
-
 
 def without_timing(report: Report) -> Report:
     """What does not depend on the machine."""
@@ -28,53 +25,6 @@ def without_timing(report: Report) -> Report:
 
 
 # -- what is printed ------------------------------------------------------------------------------
-
-
-def test_a_run_prints_a_summary_and_nothing_else(shell: Shell) -> None:
-    outcome = shell(f"convert {FIX} -o out")
-    assert (outcome.code, outcome.err) == (0, "")
-    head, left, right, scans, first, speed, wrote, look = outcome.out.splitlines()
-    assert head.split() == [
-        "sensor",
-        "model",
-        "packets",
-        "lost",
-        "rejected",
-        "columns",
-        "dropped",
-        "points",
-    ]
-    # 7 windows of 512 columns; head and tail have the other 752 of 4336 (SOURCE.md).
-    assert left.split() == ["left", "OS-0-32-U1", "271", "0", "0", "3584", "752", "90790"]
-    assert right.split() == ["right", "OS-1-32-U1", "271", "0", "0", "3584", "752", "105196"]
-    assert scans == (
-        f"7 scans at 10 Hz (0 incomplete, 0 empty windows), {7 * POINTS} points, clock utc"
-    )
-    # The first bound after the first stamps (SOURCE.md).
-    assert first == "first scan at 2026-05-04T08:00:00.100Z"
-    assert speed.startswith("0.8 s recorded in ")
-    assert wrote == "wrote out, report out/report.json"
-    assert look == "mlbatch report out makes the page, mlbatch view out plays the scans"
-
-
-def test_quiet_prints_nothing_and_verbose_more(shell: Shell) -> None:
-    quiet = shell(f"convert {FIX} -o quiet --quiet")
-    assert (quiet.code, quiet.out, quiet.err) == (0, "", "")
-    verbose = shell(f"convert {FIX} -o verbose -v")
-    first, second = verbose.out.splitlines()[:2]
-    assert first.startswith("left: OS-0-32-U1 512x10 RNG19_RFL8_SIG16_NIR16, calibration ")
-    assert first.endswith("left.json, extrinsics from rig")
-    assert second.startswith("right: OS-1-32-U1 512x10 RNG15_RFL8_NIR8, calibration ")
-
-
-def test_warnings_go_to_stderr_and_into_the_report(shell: Shell) -> None:
-    outcome = shell(f"convert {FIX} -o out --max-wait inf --quiet")
-    line = "max_wait: --max-wait inf: memory grows while a sensor is silent"
-    assert (outcome.code, outcome.out) == (0, "")
-    assert outcome.err == f"mlbatch: warning: {line}\n"
-    assert report_of("out/report.json")["warnings"] == [
-        {"code": "max_wait", "sensor": "", "message": line.removeprefix("max_wait: ")}
-    ]
 
 
 def test_a_dry_run_prints_the_report_that_a_run_writes(shell: Shell) -> None:
@@ -88,12 +38,6 @@ def test_a_dry_run_prints_the_report_that_a_run_writes(shell: Shell) -> None:
     assert without_timing(report_of("report.json")) == printed
     assert shell(f"convert {FIX} -o out.mcap").code == 0
     assert without_timing(report_of("out.mcap.report.json")) == printed
-
-
-def test_a_dry_run_ignores_the_output(shell: Shell) -> None:
-    Path("out").mkdir()
-    assert shell(f"convert {FIX} -o out --dry-run").code == 0
-    assert list(Path("out").iterdir()) == []
 
 
 def test_sensors_as_table_and_as_json_agree(shell: Shell) -> None:

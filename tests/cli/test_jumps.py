@@ -6,8 +6,6 @@ import json
 from dataclasses import replace
 from pathlib import Path
 
-import pytest
-
 from tests.builders.bags import Body, Recorded, transforms_message
 from tests.builders.mcaps import write_mcap
 from tests.builders.points import OUSTER, STAMP_NS, cloud_message, write_points
@@ -46,17 +44,6 @@ def _pieces(unit: Unit, *steps_ns: int, turns: int = 6) -> list[Unit]:
 
 
 FORWARD = 37 * NS_PER_S
-BACK = -20 * NS_PER_S
-
-
-def test_a_gap_is_no_jump(shell: Shell, tmp_path: Path) -> None:
-    """Five seconds of silence, at the sensor and at the capture host."""
-    first = Unit(turns=6)
-    later = replace(first, begin_ns=first.begin_ns + 5 * NS_PER_S, first_frame=55)
-    write_session(tmp_path, first, later)
-    outcome = shell("convert drive.pcap -o out --on-jump split")
-    assert outcome.code == 0, outcome.err
-    assert (tmp_path / "out" / "report.json").is_file()
 
 
 def test_the_other_sensors_are_cut_at_the_same_time(shell: Shell, tmp_path: Path) -> None:
@@ -68,16 +55,6 @@ def test_the_other_sensors_are_cut_at_the_same_time(shell: Shell, tmp_path: Path
     assert outcome.code == 1
     assert "clocks of the sensors cannot be compared" in outcome.err
     assert (tmp_path / "out.seg1.mcap").is_file()
-
-
-def test_arrival_times_know_no_jumps(shell: Shell, tmp_path: Path) -> None:
-    for step_ns in (FORWARD, BACK):
-        write_session(tmp_path, *_pieces(Unit(), step_ns))
-        outcome = shell("convert drive.pcap -o out --clock host --overwrite --keep-partial")
-        assert outcome.code == 0, outcome.err
-        report = json.loads((tmp_path / "out" / "report.json").read_text())
-        assert report["sensors"][0]["packets"]["accepted"] == 2 * 6 * 32
-        assert report["sensors"][0]["columns"]["dropped"] == {}
 
 
 def test_a_jump_to_an_epoch_visits_no_empty_windows(shell: Shell, tmp_path: Path) -> None:
@@ -133,21 +110,6 @@ def test_decoded_clouds_are_cut_where_their_clock_jumps(shell: Shell, tmp_path: 
             "datagrams": clouds * columns,
             "skipped": {},
         }
-
-
-@pytest.mark.parametrize("steps_ns", [(), (FORWARD,), (FORWARD, BACK)])
-def test_a_dry_run_prints_a_line_of_json_for_each_part(
-    shell: Shell, tmp_path: Path, steps_ns: tuple[int, ...]
-) -> None:
-    write_session(tmp_path, *_pieces(Unit(), *steps_ns))
-    outcome = shell("convert drive.pcap --dry-run --on-jump split")
-    assert outcome.code == 0, outcome.err
-    reports = [json.loads(line) for line in outcome.out.splitlines()]
-    assert len(reports) == len(steps_ns) + 1
-    assert shell("convert drive.pcap -o out --on-jump split").code == 0
-    written = [json.loads(path.read_text()) for path in sorted(tmp_path.glob("out*/report.json"))]
-    assert [one["grid"] for one in reports] == [one["grid"] for one in written]
-    assert [one["sensors"] for one in reports] == [one["sensors"] for one in written]
 
 
 def test_what_teaches_passes_to_later_parts_only_if_it_is_latched(

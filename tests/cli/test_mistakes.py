@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from tests.builders.captures import udp_frame
-from tests.builders.others import filled
+from tests.builders.others import EE, filled
 from tests.builders.sessions import (
     EPOCH_NS,
     FIXTURE,
@@ -120,6 +120,10 @@ def write_timed_sessions(folder: Path) -> None:
     write_session(folder / "m1", more=m1())
     write_session(folder / "m1_bare", Unit(), more=m1(), metadata=False)
     write_session(folder / "m1_pair", Unit(), more=m1())
+    gps = udp_frame(filled(512, {0: EE + b"712190403180"}), src="10.0.0.8", dport=10110)
+    write_session(folder / "m1_gps", Unit(), more=[*m1(), *((EPOCH_NS, frame) for frame in gps)])
+    later = Unit(begin_ns=Unit().begin_ns + 5 * NS_PER_S, first_frame=55)
+    write_session(folder / "gap", Unit(turns=6), later)
     second = Unit(turns=10)
     write_session(folder / "second", second)
     since_ns = 866 * NS_PER_S + 20 * NS_PER_MS
