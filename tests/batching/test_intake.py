@@ -1,7 +1,6 @@
-"""The intake of one sensor: equal to the literal one, its texts and counts; times in ms.
+"""The intake of one sensor: equal to the literal one, on any packets and batches.
 
-The rules by hand, of the literal intake as well: `test_reference.py`. Steps above 1 s need
-confirmation.
+The rules by hand, of the literal intake as well: `test_reference.py`.
 """
 
 from __future__ import annotations
@@ -15,51 +14,29 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mlbatch.arrays import I64Array
-from mlbatch.batching.intake import FOREVER, NEVER, Accepted, Arrival, Intake
-from mlbatch.errors import ClockError, ClockJump
+from mlbatch.batching.intake import NEVER, Accepted, Arrival, Intake
 from mlbatch.lidar.headers import Headers
 from tests.builders.arrivals import WIDEST, accepted_by, arrival_of
+from tests.builders.hand import MS, packet
 from tests.reference.intake import FeedPacket, Numbers, StepError
 from tests.reference.intake import Intake as LiteralIntake
 
-MS = 10**6
 S = 10**9
-Stamps = Sequence[float]
 
 
-def _feed(*packets: Stamps, keys: Sequence[int] = (), valid: Sequence[Stamps] = ()) -> Arrival:
-    """Packets of equal width, stamps in ms; received 1 ms after their largest stamp."""
-    feed = []
-    for number, stamps_ms in enumerate(packets):
-        stamps = tuple(round(stamp * MS) for stamp in stamps_ms)
-        good = tuple(map(bool, valid[number])) if valid else (True,) * len(stamps)
-        feed.append(FeedPacket(0, max(stamps) + MS, (keys or range(99))[number], stamps, good))
-    return arrival_of(feed, len(packets[0]), np.arange(len(packets)), 0)
+def _alone(*stamps_ms: float, keys: Sequence[int] = range(99)) -> Arrival:
+    """Packets of a column each, received at their stamps."""
+    feed = [packet(0, stamp, key=key) for stamp, key in zip(stamps_ms, keys, strict=False)]
+    return arrival_of(feed, 1, np.arange(len(feed)), 0)
 
 
-def _left(columns: int = 1, **options: int) -> Intake:
-    return Intake("left", np.arange(columns), **options)  # type: ignore[arg-type]
+def _left(**options: int) -> Intake:
+    return Intake("left", np.arange(1), **options)  # type: ignore[arg-type]
 
 
-def _stamps_ms(accepted: Accepted) -> list[list[float]]:
-    rows: list[list[float]] = (accepted.columns.stamp_ns / MS).tolist()
-    return rows
-
-
-def _alone(*stamps_ms: float, first_key: int = 0) -> Arrival:
-    keys = range(first_key, first_key + len(stamps_ms))
-    return _feed(*([stamp] for stamp in stamps_ms), keys=keys)
-
-
-def test_good_packets_pass_untouched() -> None:
-    intake = _left(2)
-    accepted = accepted_by(intake, _feed([10, 20], [30, 40]))
-    assert _stamps_ms(accepted) == [[10, 20], [30, 40]]
-    assert accepted.newest_ns.tolist() == [20 * MS, 40 * MS]
-    assert accepted.lowest_ns.tolist() == [10 * MS, 30 * MS]
-    assert accepted.ring_index.tolist() == [[0, 1], [WIDEST, WIDEST + 1]]
-    assert (accepted.read, accepted.oldest, accepted.invalid) == (2, 0, 0)
-    assert intake.rejected == {}
+def _stamps_ms(accepted: Accepted) -> list[float]:
+    stamps: list[float] = (accepted.columns.stamp_ns[:, 0] / MS).tolist()
+    return stamps
 
 
 def test_packets_of_other_sensors_and_damaged_ones_are_left_out() -> None:
@@ -71,86 +48,26 @@ def test_packets_of_other_sensors_and_damaged_ones_are_left_out() -> None:
     owned = np.array([False, False, False, True, False])
     intake = _left()
     accepted = intake.accept(arrival, owned)
-    assert _stamps_ms(accepted) == [[10], [50]]
+    assert _stamps_ms(accepted) == [10, 50]
     assert owned.tolist() == [True, False, True, True, True]
     assert (accepted.read, intake.rejected) == (3, {"bad_header": 1})
 
 
-# -- duplicates -----------------------------------------------------------------------------------
-
-
-def test_other_packets_of_the_same_number_are_counted_apart() -> None:
-    intake = _left()
-    accepted_by(intake, _feed([10], [20], [10], [25], keys=[5, 6, 5, 6]))
-    assert (intake.rejected, intake.renumbered) == ({"duplicate": 2}, 1)
-    # Across batches, and once each.
-    accepted_by(intake, _feed([25], [30], keys=[6, 7]))
-    accepted_by(intake, _feed([31], keys=[7]))
-    assert (intake.rejected, intake.renumbered) == ({"duplicate": 4}, 2)
-
-
-# -- stamps ---------------------------------------------------------------------------------------
-
-
 def test_a_packet_is_held_until_the_next_batch() -> None:
     intake = _left()
-    first = accepted_by(intake, _alone(10, 5000))
-    assert _stamps_ms(first) == [[10]]
+    assert _stamps_ms(accepted_by(intake, _alone(10, 5000))) == [10]
     # The second packet's pixels must stay where they are.
-    assert (intake.held_ring_index, intake.held_host_ns) == (WIDEST, 5001 * MS)
-    second = accepted_by(intake, _alone(5010, first_key=2))
-    assert _stamps_ms(second) == [[5000], [5010]]
-    assert second.position.tolist() == [0, 0]
+    assert (intake.held_ring_index, intake.held_host_ns) == (WIDEST, 5000 * MS)
+    second = accepted_by(intake, _alone(5010, keys=[2]))
+    assert (_stamps_ms(second), second.position.tolist()) == ([5000, 5010], [0, 0])
     assert intake.held_ring_index is None
 
 
-def test_a_reset_clock_is_an_error_that_names_both_times() -> None:
-    jump = accepted_by(_left(), _alone(100_000, 100_010, 3, 13)).jump
-    assert isinstance(jump, ClockError)
-    assert jump.host_ns == 4 * MS
-    assert str(jump) == (
-        "sensor left: clock reset within the recording: expected stamps of one continuous clock, "
-        "found a step back from 100.010000 s to 0.003000 s; use --on-jump split, or --clock host"
-    )
+def test_a_pass_that_measures_clocks_takes_all_and_an_offset_is_added() -> None:
+    every = _alone(10, 10, 9e6, -5, keys=[1, 1, 2, 3])
+    assert len(accepted_by(_left(takes_all=True), every).host_ns) == 4
+    assert _stamps_ms(accepted_by(_left(offset_ns=-37 * S), _alone(37_010, 37_020))) == [10, 20]
 
-
-def test_a_clock_that_is_set_forward_is_an_error_that_names_both_times() -> None:
-    """9 s within 10 ms at the host; after a silence of the host as well it is a gap."""
-    arrival = _alone(1000, 10_000, 10_010)
-    host_ns = np.array([1001, 1011, 1021]) * MS
-    jump = accepted_by(_left(finds_jumps=True), arrival._replace(host_ns=host_ns)).jump
-    assert isinstance(jump, ClockJump)
-    assert jump.host_ns == 1011 * MS
-    assert str(jump) == (
-        "sensor left: clock jump within the recording: expected stamps of one continuous clock, "
-        "found a step forward from 1.000000 s to 10.000000 s within 0.010000 s at the capture "
-        "host; use --on-jump split, or --clock host"
-    )
-    for silent_ns in (arrival.host_ns, host_ns * 0):
-        silent = arrival._replace(host_ns=silent_ns)
-        assert len(accepted_by(_left(finds_jumps=True), silent).position) == 3
-
-
-def test_a_packet_without_a_valid_column_is_accepted() -> None:
-    accepted = accepted_by(_left(), _feed([10], [9e6], [20], valid=[[1], [0], [1]]))
-    assert accepted.newest_ns.tolist() == [10 * MS, NEVER, 20 * MS]
-    assert accepted.lowest_ns.tolist() == [10 * MS, FOREVER, 20 * MS]
-
-
-def test_a_pass_that_measures_clocks_takes_all() -> None:
-    intake = _left(takes_all=True)
-    assert len(accepted_by(intake, _feed([10], [10], [9e6], [-5], keys=[1, 1, 2, 3])).host_ns) == 4
-
-
-# -- clocks ---------------------------------------------------------------------------------------
-
-
-def test_an_offset_is_added_to_the_stamps() -> None:
-    intake = _left(offset_ns=-37 * S)
-    assert _stamps_ms(accepted_by(intake, _alone(37_010, 37_020))) == [[10], [20]]
-
-
-# -- the literal intake ---------------------------------------------------------------------------
 
 # Numbers wrap there in feeds.
 MODULUS = 5000
@@ -180,9 +97,9 @@ def _literal(feed: Sequence[FeedPacket], sizes: Sequence[int], *, by_host: bool)
     intake = LiteralIntake(by_host, finds_jumps=not by_host)
     numbers = Numbers(MODULUS)
     ends = set(np.cumsum(sizes).tolist())
-    for at, packet in enumerate(feed):
+    for at, sent in enumerate(feed):
         try:
-            accepted = intake.take(packet)
+            accepted = intake.take(sent)
         except StepError as step:
             seconds = f"from {step.before_ns / S:.6f} s to {step.after_ns / S:.6f} s"
             seen.step = seconds, step.host_ns
@@ -277,10 +194,9 @@ def _drawn(rng: random.Random) -> tuple[list[FeedPacket], list[int], bool]:
             stamps[rng.randrange(width)] += rng.choice([-2 * S, -S, S, 9 * S, 2**62])
         valid = tuple(rng.random() >= wild for _ in stamps)
         number = rng.choice([-1, key % 5, key]) if rng.random() < wild else key
-        packet = FeedPacket(
-            0, host_ns, number % MODULUS if number >= 0 else -1, tuple(stamps), valid
-        )
-        feed.append(rng.choice(feed) if feed and rng.random() < wild / 2 else packet)
+        key_sent = number % MODULUS if number >= 0 else -1
+        new = FeedPacket(0, host_ns, key_sent, tuple(stamps), valid)
+        feed.append(rng.choice(feed) if feed and rng.random() < wild / 2 else new)
     sizes: list[int] = []
     most = rng.choice([1, 2, 7, len(feed)])
     while sum(sizes) < len(feed):

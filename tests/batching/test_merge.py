@@ -110,20 +110,3 @@ def test_figures_are_those_of_their_definitions(seed: int, count: int, most: int
     for window, begin, end in zip(found, [0, *ends], ends, strict=False):
         part = columns.take(slice(begin, end))
         assert list(window) == [_counted(part, number) for number in range(len(POSITIONS))]
-
-
-def test_figures_by_hand() -> None:
-    # 120 sectors of 3 positions each: 0, 0, 1, 0, 119; the second sensor has one column.
-    stamp_ns = np.array([0, 10, 40, 45, 50, 51, 60, 75])
-    encoder = np.array([0, 2, 3, 1, 1 << 31, 359, 100, 100])
-    sensor = np.array([0, 0, 0, 0, 1, 0, 0, 0])
-    columns = WindowColumns(stamp_ns, sensor, stamp_ns, encoder)
-    merge = ColumnMerge((360, None, 8))
-    assert merge.figures(columns, [6, 8]) == [
-        [
-            ColumnFigures(5, 30, 3 / 120, 1 / 120, 0, 51),
-            ColumnFigures(1, 0, 1 / 120, 0.0, 50, 50),
-            NO_COLUMNS,
-        ],
-        [ColumnFigures(2, 15, 1 / 120, 0.0, 60, 75), NO_COLUMNS, NO_COLUMNS],
-    ]

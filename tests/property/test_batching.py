@@ -6,12 +6,10 @@ import random
 from dataclasses import replace
 
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from mlbatch.errors import ClockError
 from tests.builders.fast import run_fast
-from tests.builders.feeds import Case, feeds, groups, interleavings, random_feed
+from tests.builders.feeds import groups, interleavings, random_feed
 from tests.reference.batching import FeedPacket, Outcome, Settings, reference_scans
 
 SEEDS_A_BLOCK = 250
@@ -69,15 +67,6 @@ def test_fast_batcher_equals_the_reference(block: int) -> None:
         expected = by_reference(feed, options)
         found = differences(expected, by_fast(feed, options, sizes))
         assert not found, f"random_feed({seed}), {options}, groups {sizes}: {found}"
-
-
-@settings(max_examples=100)
-@given(feeds(), st.randoms(use_true_random=False))
-def test_grouping_does_not_matter(case: Case, rng: random.Random) -> None:
-    feed, options = case
-    expected = by_reference(feed, options)
-    for sizes in ([1] * len(feed), [len(feed)], groups(rng, len(feed))):
-        assert not differences(expected, by_fast(feed, options, sizes))
 
 
 @pytest.mark.parametrize("block", INTERLEAVED_BLOCKS)
