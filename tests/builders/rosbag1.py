@@ -11,7 +11,6 @@ from rosbags.rosbag1 import Writer
 
 from tests.builders.bags import Recorded, definition
 
-CONNECTION = 7
 CHUNK = 5
 
 

@@ -73,12 +73,6 @@ def test_host_steps_are_removed(by_ms: int) -> None:
     assert np.abs(errors).max() < 150 * NS_PER_US
 
 
-@pytest.mark.parametrize("by_ns", [-1020 * NS_PER_S, -37 * NS_PER_S, -4_000_000, 4_000_000, TAI_NS])
-def test_steps_of_the_sensor_are_removed(by_ns: int) -> None:
-    one = heard(replace(UPTIME, drift_ppm=8, steps=((30, by_ns),)))
-    assert np.abs(error_ns(one)).max() < 150 * NS_PER_US
-
-
 def test_drift_that_comes_and_goes() -> None:
     """3 ppm up and down in ten minutes, on top of 20 ppm."""
     clock = replace(UPTIME, drift_ppm=20, wander=(3, 600))
@@ -125,18 +119,6 @@ def test_damaged_stamps_stay_damaged() -> None:
     np.testing.assert_array_equal(made.apply(stamp_ns), stamp_ns)
     good_ns = np.append(stamp_ns, BEGIN_NS + TAI_NS)
     assert abs(int(made.apply(good_ns)[-1]) - BEGIN_NS) < NS_PER_MS
-
-
-def test_one_packet_is_enough_for_an_offset() -> None:
-    one = heard(UPTIME, EXACT, seconds=0.003)
-    assert fitted(one).apply(one.stamp_ns).tolist() == one.host_ns.tolist()
-
-
-def test_residuals() -> None:
-    made = fitted(heard(UPTIME, EXACT))
-    assert (made.residual_p50_ns, made.residual_max_ns) == (0, 0)
-    noisy = fitted(heard(UPTIME, ETHERNET))
-    assert 0 < noisy.residual_p50_ns < 20 * NS_PER_US
 
 
 # -- onto the first sensor's clock ----------------------------------------------------------------

@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from mlbatch.discovery.calibrations import find_calibrations
@@ -20,19 +19,10 @@ from tests.builders.sessions import (
     write_session,
 )
 
-POSE = [0.0, -1.0, 0.0, 1.5, 1.0, 0.0, 0.0, -0.25, 0.0, 0.0, 1.0, 2.0, 0.0, 0.0, 0.0, 1.0]
-
 
 def _discover(capture: Path, selection: SensorSelection | None = None) -> Discovery:
     table = StreamTable()
     return discover([open_recording(capture, table)], table, selection or SensorSelection())
-
-
-def test_sensors_without_a_rig_are_named_after_their_serial_number(tmp_path: Path) -> None:
-    capture = write_session(tmp_path, Unit(spec=replace(SMALL, extrinsic_m=POSE)))
-    (sensor,) = _discover(capture).sensors
-    assert (sensor.name, sensor.pose.source) == ("ouster_111", "metadata")
-    np.testing.assert_array_equal(sensor.pose.body_from_sensor, np.reshape(POSE, (4, 4)))
 
 
 def test_sensors_without_a_serial_number_are_numbered(tmp_path: Path) -> None:

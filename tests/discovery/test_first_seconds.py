@@ -6,7 +6,6 @@ import json
 from collections.abc import Generator
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from mlbatch.discovery import first_seconds
@@ -14,21 +13,15 @@ from mlbatch.discovery.first_seconds import FirstSeconds, is_without_packets
 from mlbatch.readers import open_recording
 from mlbatch.readers.capture.recording import CaptureRecording
 from mlbatch.types import PacketBatch, StreamTable
-from tests.builders.reading import packets_in
-from tests.builders.sessions import FIXTURE, Shell, Unit, twin, write_session
+from tests.builders.sessions import FIXTURE, Shell, Unit, write_session
 
 CAPTURE = FIXTURE / "two_lidars.pcap"
 RUN = f"convert {CAPTURE} --rig {FIXTURE / 'rig.yaml'} --dry-run --quiet"
-Payloads = list[tuple[int, bytes]]
 
 
 def _first(path: Path) -> FirstSeconds:
     table = StreamTable()
     return FirstSeconds([open_recording(path, table)], table)
-
-
-def _payloads(batches: Generator[PacketBatch, None, None]) -> Payloads:
-    return [one[1:] for batch in batches for one in packets_in(batch)]
 
 
 @pytest.mark.parametrize(
@@ -64,15 +57,6 @@ def test_a_short_capture_is_read_once(
     assert documents[0] == documents[1]
 
 
-def test_packets_that_are_kept_are_those_of_the_capture() -> None:
-    """Fragments included: they were assembled where the next ones are."""
-    first = _first(CAPTURE)
-    assert first.has_all
-    expected = _payloads(open_recording(CAPTURE, StreamTable()).packets())
-    assert _payloads(first.whole()) == expected
-    assert _payloads(first.whole()) == expected
-
-
 def test_a_longer_capture_is_read_again(tmp_path: Path) -> None:
     """Of 12 s ten are sampled; all are in the whole."""
     unit = Unit(turns=120)
@@ -93,14 +77,3 @@ def test_what_is_kept_is_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     for most, is_kept in ((size - 1, False), (size, True)):
         monkeypatch.setattr(first_seconds, "KEPT_BYTES", most)
         assert _first(capture).has_all is is_kept
-
-
-def test_of_several_recordings_nothing_is_kept(tmp_path: Path) -> None:
-    """They are merged by receive time, and compared as they are read."""
-    one = Unit()
-    paths = [write_session(tmp_path / "1", one), write_session(tmp_path / "2", twin(one, 222))]
-    table = StreamTable()
-    first = FirstSeconds([open_recording(path, table) for path in paths], table)
-    assert not first.has_all
-    host_ns = np.concatenate([batch.host_ns for batch in first.whole()])
-    assert len(host_ns) == 2 * 32 * one.turns

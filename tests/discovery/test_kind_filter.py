@@ -118,15 +118,3 @@ def test_streams_beyond_the_table_are_one(monkeypatch: pytest.MonkeyPatch, tmp_p
     assert table.number(Stream("10.0.0.1", 1)) == 5
     assert len(table.streams) == 6
     assert MOST_STREAMS == 65_536
-
-
-def test_streams_that_another_recording_filled_the_table_with(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    monkeypatch.setattr("mlbatch.types.MOST_STREAMS", 2)
-    table = StreamTable()
-    for number, ports in enumerate([(1, 2, 3), (3, 2, 1)]):
-        frames = [udp_frame(b"x", dport=port)[0] for port in ports]
-        path = write_pcap(tmp_path / str(number), [(0, frame) for frame in frames])
-        (batch,) = open_capture(path, streams=table).packets()
-        assert batch.stream.tolist() == [{1: 0, 2: 1, 3: 2}[port] for port in ports]

@@ -9,13 +9,11 @@ from pathlib import Path
 
 import pytest
 
-from mlbatch.discovery.overlap import LidarSpan, iso, problem
 from mlbatch.readers import open_recording
 from mlbatch.types import StreamTable
 from tests.builders.captures import udp_frame, write_pcap
 from tests.builders.reading import packets_in
 from tests.builders.sessions import (
-    EPOCH_NS,
     NS_PER_MS,
     NS_PER_S,
     Records,
@@ -213,32 +211,3 @@ def test_an_end_before_the_second_recording_does_not_help(shell: Shell, tmp_path
     right = _capture(tmp_path / "right.pcap", LATER.records, [LATER])
     done = shell("convert", left, right, "-o", "out", IDENTITY, "--end", "+0.2")
     assert (done.code, "no_overlap" in done.err) == (1, True)
-
-
-def _span(lidars: str, first: int, last: int, *, is_whole: bool = True) -> LidarSpan:
-    return LidarSpan(Path(f"{lidars}{first}.pcap"), set(lidars), first, last, is_whole)
-
-
-@pytest.mark.parametrize(
-    ("spans", "is_refused"),
-    [
-        ([_span("a", 0, 10), _span("b", 10, 20)], False),
-        ([_span("a", 0, 10), _span("b", 11, 20)], True),
-        # The third one overlaps the second one only.
-        ([_span("a", 0, 10), _span("b", 5, 20), _span("c", 15, 30)], True),
-        ([_span("a", 0, 10), _span("ab", 11, 20), _span("b", 21, 30)], False),
-        ([_span("a", 0, 10, is_whole=False), _span("b", 11, 20)], False),
-        ([_span("a", 0, 10), _span("b", 11, 20), _span("a", 30, 40)], False),
-        ([_span("a", 0, 10), LidarSpan(Path("imu.pcap"))], False),
-    ],
-)
-def test_which_spans_are_one_session(spans: Sequence[LidarSpan], is_refused: bool) -> None:
-    text, is_optional = problem(spans)
-    assert (bool(text), is_optional) == (is_refused, False)
-    text, is_optional = problem(spans, optional="bc")
-    assert (bool(text), is_optional) == (is_refused, is_refused)
-
-
-def test_receive_times_are_shown_in_iso_form() -> None:
-    assert iso(EPOCH_NS + 1_999_999) == "2027-01-15T08:00:00.001Z"
-    assert iso(0) == "1970-01-01T00:00:00.000Z"

@@ -26,11 +26,6 @@ from tests.builders.sessions import (
 
 Report = dict[str, Any]
 Convert = Callable[[str], Report]
-_METADATA_ADVICE = (
-    ". Ouster calls it metadata (JSON): get it with `curl "
-    "http://SENSOR_IP/api/v1/sensor/metadata > left.json`, or take the .json that Ouster Studio, "
-    "ouster-cli or the driver saved next to its recording"
-)
 PACKETS = 96  # 3 revolutions
 IDENTITY = "--identity-extrinsics"
 
@@ -364,30 +359,6 @@ def test_given_metadata_replace_the_search(convert: Convert, tmp_path: Path) -> 
     assert _read(report) == {"ouster_222": PACKETS}
     assert report["sensors"][0]["calibration"].endswith("elsewhere.json")
     assert report["warnings"] == []
-
-
-@pytest.mark.parametrize("option", ["", "--strict"])
-def test_a_lidar_left_out_whole_is_an_error(shell: Shell, tmp_path: Path, option: str) -> None:
-    capture = write_session(tmp_path, ONE, twin(ONE, 333))
-    (tmp_path / "333.json").unlink()
-    outcome = shell(f"convert {capture} -o {tmp_path / 'out'} {option}")
-    assert outcome.code == 1
-    assert outcome.err == (
-        f"mlbatch: error: {capture}: 10.0.0.2 > port 7502: {NEEDS_METADATA.format(333)}; expected "
-        "metadata that match, found only 111.json; give --metadata FILE, or leave it out with "
-        f"--ignore 10.0.0.2:7502{_METADATA_ADVICE}\n"
-    )
-    assert not (tmp_path / "out").exists()
-    # Without a conversion it is a row of the table.
-    assert "metadata" in shell(f"inspect {capture}").out
-
-
-def test_foreign_files_in_the_directory_are_ignored(convert: Convert, tmp_path: Path) -> None:
-    capture = write_session(tmp_path, ONE)
-    for name, text in (("a.json", "{}"), ("b.json", "no json"), ("c.json", '{"sensor_info": 1}')):
-        (tmp_path / name).write_text(text)
-    report = convert(str(capture))
-    assert (_read(report), report["warnings"]) == ({"ouster_111": PACKETS}, [])
 
 
 def test_a_rig_separates_equal_lidars_without_serial_numbers_by_address(

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from mlbatch.discovery.discover import SensorSelection, discover
-from mlbatch.discovery.sampler import SAMPLES_PER_KIND, KindSamples, Sampler, split_by_kind
+from mlbatch.discovery.sampler import SAMPLES_PER_KIND, KindSamples, Sampler
 from mlbatch.discovery.types import PacketKind
 from mlbatch.readers import open_recording
 from mlbatch.types import PacketBatch, Stream, StreamTable
@@ -35,18 +35,6 @@ def _sampled(batches: list[PacketBatch]) -> Sampler:
     for batch in batches:
         sampler.add(batch)
     return sampler
-
-
-def test_packets_are_split_by_stream_and_size_in_receive_order() -> None:
-    stream = np.array([1, 0, 1, 1, 0])
-    size = np.array([48, 99, 48, 6400, 99])
-    batch = PacketBatch(np.zeros(9000, np.uint8), np.zeros(5, np.int64), size, stream, stream)
-    found = {kind: index.tolist() for kind, index in split_by_kind(batch)}
-    assert found == {
-        PacketKind(0, 99): [1, 4],
-        PacketKind(1, 48): [0, 2],
-        PacketKind(1, 6400): [3],
-    }
 
 
 @pytest.mark.parametrize("batch_size", [1, 7, 26, 1000])
@@ -93,19 +81,6 @@ def test_rate_and_clock_of_a_sensor(tmp_path: Path) -> None:
         assert offset_ns is not None
         assert offset_ns / NS_PER_S == pytest.approx(offset_s, abs=1e-9)
         assert found.sampler.has_receive_times(sensor)
-
-
-def test_samples_may_be_asked_for_between_batches() -> None:
-    host_ns = [BEGIN_NS + number * NS_PER_MS for number in range(6)]
-    sampler = _sampled([_batch(host_ns[:4], [1, 2, 3, 4])])
-    samples = sampler.kinds[PacketKind(0, SIZE)]
-    for words, more in (([1, 2, 3, 4], []), ([1, 2, 3, 4, 5, 6], [5, 6])):
-        if more:
-            sampler.add(_batch(host_ns[4:], more))
-        for _ in range(2):
-            packets, received_ns = samples.arrays()
-            assert packets[:, 0].tolist() == words
-            assert received_ns.tolist() == host_ns[: len(words)]
 
 
 # -- shares of the bytes, worked by hand ------------------------------------------------------

@@ -18,9 +18,8 @@ from mlbatch.ros.packet_types import PACKET_TYPES
 from mlbatch.types import StreamTable
 from tests.builders.run import RECORDINGS, ROOT, in_memory
 from tests.builders.sessions_of_bags import edited_copy
-from tests.matrix.cells import plain
 from tests.matrix.containers import CONTAINERS as MATRIX
-from tests.matrix.lidars import write_metadata
+from tests.matrix.lidars import plain, write_metadata
 
 # MANIFEST.md: topic, packets, their bytes.
 BAGS = {

@@ -9,8 +9,6 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
-import numpy as np
-
 from tests.builders.bags import Recorded
 from tests.builders.captures import Packet, Section, udp_frame, write_pcap, write_pcapng
 from tests.builders.mcaps import write_mcap
@@ -95,9 +93,3 @@ def rig_text(session: Session, container: str, clocks: Mapping[str, str] | None 
         if clocks and sent.vendor in clocks:
             lines.append(f"    clock: {clocks[sent.vendor]}")
     return "\n".join(lines) + "\n"
-
-
-def span_ns(session: Session) -> tuple[int, int]:
-    """First and last receive time."""
-    hosts = np.concatenate([sent.host_ns for sent in session])
-    return int(hosts.min()), int(hosts.max())

@@ -22,11 +22,13 @@ from mlbatch.simulate.velodyne.encode import VelodyneSpec
 
 NS_PER_S = 10**9
 NS_PER_MS = 10**6
-NS_PER_US = 10**3
 HOUR_NS = 3600 * NS_PER_S
 # One reading in so many has a return.
 SPARSE = 16
 RECEIVE_STEP_NS = 10_000
+# Length of a session; events are at times well inside windows.
+LENGTH_NS = 500 * NS_PER_MS
+NOON_NS = 1_700_000_000 * NS_PER_S // HOUR_NS * HOUR_NS + 1000 * NS_PER_S
 
 OUSTER = OusterSpec(beams=16, columns_per_frame=512, serial=111)
 OUSTER_STEP_NS = 100 * NS_PER_MS // OUSTER.columns_per_frame
@@ -199,6 +201,12 @@ VENDORS: Mapping[str, Vendor] = {
         begin_ns=7_300_000,
     ),
 }
+
+
+def plain(vendor: str) -> Sent:
+    """Half a second around noon."""
+    row = VENDORS[vendor]
+    return row.send(Spell(NOON_NS + row.begin_ns, LENGTH_NS))
 
 
 def write_metadata(folder: Path) -> None:

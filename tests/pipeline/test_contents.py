@@ -16,7 +16,7 @@ from tests.builders.bags import Body, Recorded, fixture_messages
 from tests.builders.mcaps import write_mcap
 from tests.builders.rosbag1 import write_rosbag1
 from tests.builders.rosbag2 import write_rosbag2
-from tests.builders.sessions import CAPTURE, EPOCH_NS, FIXTURE, NS_PER_MS, NS_PER_S, Shell, Unit
+from tests.builders.sessions import EPOCH_NS, NS_PER_MS, NS_PER_S, Shell, Unit
 from tests.builders.sessions_of_bags import unit_messages
 
 EVERY_NS = 50 * NS_PER_MS
@@ -52,14 +52,6 @@ def test_other_topics_are_counted(shell: Shell, tmp_path: Path) -> None:
     text = shell(f"inspect {bag}").out
     row = next(line for line in text.splitlines() if line.startswith("/note"))
     assert row.split() == ["/note", "std_msgs/String", "20", "20.0"]
-
-
-def test_packet_topics_are_no_other_topics(shell: Shell, tmp_path: Path) -> None:
-    bag = write_mcap(tmp_path / "drive.mcap", _drive(turns=5))
-    found = _inspected(shell, str(bag))
-    packets = {one["stream"] for one in found["streams"]}
-    assert packets
-    assert packets.isdisjoint(one["topic"] for one in found["topics"])
 
 
 def test_a_recording_of_messages_alone_is_counted(shell: Shell, tmp_path: Path) -> None:
@@ -119,9 +111,3 @@ def test_the_index_of_a_bag_states_its_end(
     recording = open_recording(bag, StreamTable())
     assert recording.last_ns == max(one.log_ns for one in messages)
     assert recording_report(recording).last_host_ns == recording.last_ns
-
-
-def test_a_rig_names_the_sensors(shell: Shell) -> None:
-    found = _inspected(shell, f"{CAPTURE} --rig {FIXTURE / 'rig.yaml'}")
-    assert {one["sensor"] for one in found["streams"]} - {""} == {"left", "right"}
-    assert {one["extrinsics"] for one in found["streams"]} - {""} == {"rig"}

@@ -18,10 +18,8 @@ from mlbatch.simulate.velodyne.encode import VelodyneSpec
 from tests.builders.captures import udp_frame
 from tests.builders.sessions import (
     CAPTURE,
-    NO_RECORDINGS,
     NS_PER_MS,
     NS_PER_S,
-    RECORDINGS,
     SMALL,
     Shell,
     Unit,
@@ -32,8 +30,6 @@ from tests.builders.sessions import (
 )
 from tests.builders.vendor_sessions import framed, lidar_payloads, write_capture
 
-OUSTER = RECORDINGS / "ouster"
-needs_recordings = pytest.mark.skipif(not RECORDINGS.is_dir(), reason=NO_RECORDINGS)
 LEFT = "ouster_122647000123"
 RIGHT = "ouster_122648000456"
 
@@ -79,15 +75,6 @@ def test_the_table_of_the_fixture(shell: Shell) -> None:
     assert lines[1:] == [[str(CAPTURE), "pcap", "2.5", "2026-05-04T08:00:00.020Z", "0.850"]]
 
 
-def test_json_has_the_same_values_with_all_digits(shell: Shell) -> None:
-    (left,) = [s for s in _streams(shell, str(CAPTURE)) if s["serial"] == "122647000123"]
-    assert (left["model"], left["mode"]) == ("OS-0-32-U1", "512x10 RNG19_RFL8_SIG16_NIR16")
-    assert (left["bytes"], left["packets"], left["lost"]) == (6400, 271, 0)
-    assert left["timescale"] == "utc"
-    # The newest of 512 columns in 99.99 ms is 0.195 ms older than its packet, which takes a while.
-    assert -1.5 < left["offset_ms"] < -0.195
-
-
 def test_loss_and_clock_of_an_unsynchronised_lidar(shell: Shell, tmp_path: Path) -> None:
     unit = Unit(begin_ns=1000 * NS_PER_S, host_ns=1_700_000_000 * NS_PER_S)
     capture = write_session(tmp_path, unit)
@@ -110,26 +97,6 @@ def test_a_stream_without_metadata(shell: Shell, tmp_path: Path) -> None:
     outcome = shell(f"inspect {capture}")
     assert outcome.out.splitlines()[-1] == (
         "note: no lidar with its metadata; files examined: none"
-    )
-
-
-def test_a_second_lidar_at_one_address_is_noted(shell: Shell, tmp_path: Path) -> None:
-    capture = write_session(tmp_path, Unit(), twin(Unit(), 333, Unit().ip))
-    (tmp_path / "333.json").unlink()
-    outcome = shell(f"inspect {capture}")
-    assert outcome.out.splitlines()[-1] == (
-        "note: 10.0.0.1 > port 7502: Ouster lidar, serial 333, 1280 bytes: needs its metadata as "
-        "well; 96 packets are of no sensor; give its --metadata"
-    )
-
-
-def test_a_damaged_recording_is_noted(shell: Shell, tmp_path: Path) -> None:
-    capture = write_session(tmp_path, Unit())
-    capture.write_bytes(capture.read_bytes()[:-100])
-    outcome = shell(f"inspect {capture}")
-    assert outcome.out.splitlines()[-1] == (
-        "note: drive.pcap: byte 127134: the file ends within a record; expected 1338 bytes, "
-        "found 1238"
     )
 
 
@@ -259,62 +226,6 @@ def test_the_order_of_sensors_is_that_of_serial_numbers(shell: Shell, tmp_path: 
     shell(f"inspect {capture} --write-rig rig.yaml")
     names = [sensor.name for sensor in read_rig(Path("rig.yaml")).sensors]
     assert names == ["ouster_999", "ouster_1000"]
-
-
-# (case, streams with what sensor) by recordings/MANIFEST.md.
-REAL = {
-    "os0-128_512x10_crc/crc_test.pcap": {
-        7502: ("ouster_122247000785", 34, "uptime"),
-        7503: ("ouster_122247000785", 10, ""),
-    },
-    "os1-128_v2.3.0_rng15_3frames/OS-1-128_v2.3.0_1024x10_lb_n3.pcap": {
-        7502: ("ouster_122201000998", 192, "uptime"),
-        7503: ("ouster_122201000998", 30, ""),
-    },
-    "os1-64_fw1_legacy_broadcast/ouster_example.pcap": {7502: ("ouster_1", 100, "utc")},
-    "os1-64_fw2.0_legacy_reduced-config/OS-1-64_1024x10_fw20.pcap": {
-        7502: ("ouster_1", 64, "uptime"),
-        7503: ("ouster_1", 11, ""),
-    },
-    "os0-128_windowed/windowed_frame1.pcap": {
-        53750: ("ouster_992108000265", 17, "uptime"),
-        7503: ("ouster_992108000265", 10, ""),
-    },
-    # 540.8 s ahead of the capture host: neither UTC nor TAI.
-    "os2-128_duplicate-ip-id/duplicate_id.pcap": {34636: ("ouster_992219000042", 1, "unknown")},
-    "os0-128_imu-zone-no-lidar/imu_zm_no_lidar.pcap": {7513: ("", 8, ""), 7514: ("", 1, "")},
-    "empty-pcap/empty_pcap.pcap": {},
-}
-
-
-@needs_recordings
-@pytest.mark.parametrize("case", REAL)
-def test_real_recordings(shell: Shell, case: str) -> None:
-    found = {
-        int(stream["stream"].split()[-1]): (
-            stream["sensor"],
-            stream["packets"],
-            stream["timescale"],
-        )
-        for stream in _streams(shell, str(OUSTER / case))
-    }
-    assert found == REAL[case]
-
-
-@needs_recordings
-@pytest.mark.parametrize("kind", ["legacy", "nonlegacy"])
-def test_two_real_sensors_on_one_port(shell: Shell, kind: str) -> None:
-    case = OUSTER / f"two-sensors_same-ports_{kind}" / f"same_ports_{kind}.pcap"
-    streams = _streams(shell, str(case))
-    found = {(s["stream"].split()[0], s["sensor"], s["bytes"]) for s in streams}
-    first = ("169.254.92.158", "ouster_122247000785")
-    second = ("169.254.238.111", "ouster_122239000672")
-    sizes = {"legacy": (24896, 12608), "nonlegacy": (16640, 16640)}[kind]
-    expected = {(*first, sizes[0]), (*second, sizes[1])}
-    if kind == "nonlegacy":
-        expected |= {(*first, 48), (*second, 48)}
-    assert found == expected
-    assert all("same_ports" in s["calibration"] for s in streams if s["bytes"] > 48)
 
 
 # -- the whole recording ------------------------------------------------------------------------

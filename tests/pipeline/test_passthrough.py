@@ -139,13 +139,6 @@ def test_a_full_disk_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
     assert "\n" not in str(error.value)
 
 
-def test_a_folder_that_is_not_there_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("tempfile.tempdir", "/no/folder")
-    queue = MessageQueue([], frozenset({"cdr"}))
-    with pytest.raises(ExportError, match=r"^/no/folder: .*No such file.*set TMPDIR"):
-        queue.add(Message(TOPICS[0], at, bytes(300_000)) for at in range(20))
-
-
 def test_imu_samples_without_a_scan_are_joined() -> None:
     counts = DecodedCounts()
     samples = ImuQueue([counts], [0], has_place=True)

@@ -96,37 +96,6 @@ def test_transcript(shell: Shell, interrupted: Path, tmp_path: Path, name: str) 
     assert contents(Path()) == contents(Path("whole"))
 
 
-def test_it_continues_after_the_scans_that_are_safe(
-    shell: Shell, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    whole = _whole(shell)
-    _interrupt(shell)
-    first = Path("out.partial/000000.npz").stat().st_mtime_ns
-    saved = []
-    encode = npz.NpzEncoder.encode
-
-    def counting(encoder: npz.NpzEncoder, scan: Scan) -> list[Bytes]:
-        saved.append(scan.index)
-        return encode(encoder, scan)
-
-    monkeypatch.setattr(npz.NpzEncoder, "encode", counting)
-    outcome = shell(f"convert {CAPTURE} -o out --resume")
-    assert outcome.code == 0
-    assert outcome.err == "mlbatch: out: resumed after 3 scans\n"
-    assert saved == [3, 4, 5, 6]
-    assert Path("out/000000.npz").stat().st_mtime_ns == first
-    assert contents(Path()) == whole
-
-
-def test_the_head_and_slices_are_not_made_again(shell: Shell) -> None:
-    words = f"{CAPTURE} --keep-partial --slices 2"
-    whole = _whole(shell, words)
-    _interrupt(shell, f"{words} -o out")
-    outcome = shell(f"convert {words} -o out --resume")
-    assert outcome.err == "mlbatch: out: resumed after 3 scans\n"
-    assert contents(Path()) == whole
-
-
 def test_nohup_outlives_its_terminal(shell: Shell, monkeypatch: pytest.MonkeyPatch) -> None:
     before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
     encode = npz.NpzEncoder.encode
@@ -138,25 +107,6 @@ def test_nohup_outlives_its_terminal(shell: Shell, monkeypatch: pytest.MonkeyPat
     monkeypatch.setattr(npz.NpzEncoder, "encode", ending)
     assert shell(f"convert {CAPTURE} -o out").code == 0
     assert signal.signal(signal.SIGHUP, before) is signal.SIG_IGN
-
-
-def test_an_interrupt_after_the_last_rename_leaves_the_output_alone(
-    shell: Shell, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def ending(target: Path, fsync: bool) -> None:
-        raise KeyboardInterrupt
-
-    whole = _whole(shell)
-    with monkeypatch.context() as patch:
-        patch.setattr(atomic, "tidy", ending)
-        outcome = shell(f"convert {CAPTURE} -o out")
-    assert (outcome.code, outcome.err) == (130, "mlbatch: error: interrupted\n")
-    assert [path.name for path in Path().iterdir() if path.name != "whole"] == ["out"]
-    assert shell("verify out").code == 0
-    # The list of files under construction is all that is too many.
-    assert contents(Path()).keys() - whole.keys() == {"out/files.jsonl"}
-    assert "is complete" in shell(f"convert {CAPTURE} -o out --resume").err
-    assert contents(Path()) == whole
 
 
 class _Interrupted(threading.Condition):
@@ -486,19 +436,6 @@ def test_a_changed_byte_of_a_finished_file_is_found(shell: Shell, words: str, jo
         assert Path("out", name).stat().st_mtime_ns == time_ns
 
 
-@pytest.mark.parametrize("name", ["out.mcap", "out.bag", "out --format rosbag2"])
-def test_an_output_in_one_file_is_made_from_the_start(shell: Shell, name: str) -> None:
-    Path("whole").mkdir()
-    assert shell(f"convert {CAPTURE} -o whole/{name}").code == 0
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(files.Files, "complete", _refuse)
-        assert shell(f"convert {CAPTURE} -o {name}").code == 1
-    outcome = shell(f"convert {CAPTURE} -o {name} --resume")
-    target = name.split()[0]
-    assert outcome.err == f"mlbatch: {target}: nothing to resume; started over\n"
-    assert contents(Path()) == contents(Path("whole"))
-
-
 def _refuse(own: files.Files) -> None:
     raise ExportError("stopped")
 
@@ -551,30 +488,6 @@ def test_an_output_that_cannot_be_opened_leaves_nothing(
     outcome = shell(f"convert {CAPTURE} -o out")
     assert (outcome.code, "found an existing one" in outcome.err) == (1, True)
     assert [path.name for path in Path().iterdir()] == ["out"]
-
-
-def _changed(lines: list[bytes]) -> list[bytes]:
-    return [*lines[:2], lines[2].replace(b"0", b"1", 1), *lines[3:]]
-
-
-def _cut_off(lines: list[bytes]) -> list[bytes]:
-    return [*lines[:3], lines[3][:-7]]
-
-
-@pytest.mark.parametrize("change", [_changed, _cut_off])
-def test_a_damaged_list_is_continued_twice(
-    shell: Shell, change: Callable[[list[bytes]], list[bytes]]
-) -> None:
-    """Lines behind a damaged one count, also those of a second run that is interrupted."""
-    whole = _whole(shell)
-    _interrupt(shell)
-    JOURNAL.write_bytes(b"".join(change(JOURNAL.read_bytes().splitlines(keepends=True))))
-    with pytest.MonkeyPatch.context() as patch:
-        _fail_at(patch, 3, KeyboardInterrupt())
-        assert shell(f"convert {CAPTURE} -o out --resume").code == 130
-    outcome = shell(f"convert {CAPTURE} -o out --resume")
-    assert outcome.err == "mlbatch: out: resumed after 5 scans\n"
-    assert contents(Path()) == whole
 
 
 def test_no_change_of_a_byte_gives_another_scan(shell: Shell) -> None:

@@ -7,14 +7,11 @@ step over such frames many at a time.
 from __future__ import annotations
 
 import random
-import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from mcap.writer import IndexType
 
 from tests.builders import rosbag2
@@ -122,17 +119,3 @@ def test_the_first_buffer_may_end_at_every_byte(tmp_path: Path, name: str) -> No
     for buffer_bytes in _sizes(name, path.stat().st_size):
         assert packets_read(name, path, buffer_bytes) == packets, buffer_bytes
     assert packets_read(name, path, 1 << 22) == packets
-
-
-_ROWS = st.lists(st.tuples(st.integers(1, 200), st.integers(1, 200)), min_size=1, max_size=4)
-
-
-@_EACH
-@settings(max_examples=15)
-@given(rows=_ROWS, buffer_bytes=st.integers(_SMALLEST, 20_000))
-def test_any_rows_and_any_buffer(name: str, rows: list[tuple[int, int]], buffer_bytes: int) -> None:
-    packets = packets_of(rows)
-    with tempfile.TemporaryDirectory() as folder:
-        path = FORMATS[name](Path(folder), packets)
-        assert packets_read(name, path, buffer_bytes) == packets
-        assert packets_read(name, path, 1 << 22) == packets

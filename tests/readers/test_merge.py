@@ -21,7 +21,6 @@ from tests.builders.captures import (
     pcap_bytes,
     section_bytes,
     udp_frame,
-    write_pcap,
 )
 from tests.builders.reading import Seen, assert_balanced, open_capture, seen_of
 
@@ -77,10 +76,6 @@ def expected(session: Session) -> list[tuple[int, int]]:
     return [(number, index) for _, number, index in sorted(keyed)]
 
 
-def test_a_step_back_keeps_its_recordings_order() -> None:
-    assert merged([[10, 3, 11], [4, 10, 12]]) == [(1, 0), (0, 0), (0, 1), (1, 1), (0, 2), (1, 2)]
-
-
 class Notes(Batches):
     """A recording of nothing but messages, three in a batch."""
 
@@ -130,28 +125,6 @@ def test_messages_alone_are_read_by_their_log_times() -> None:
 )
 def test_merging_is_sorting(session: Session, seed: int) -> None:
     assert merged(session, seed) == expected(session)
-
-
-def test_captures_merge_and_a_single_one_passes_through(tmp_path: Path) -> None:
-    streams = StreamTable()
-    paths = []
-    for number in (1, 2):
-        frames = [
-            (i * 1000 + number, f)
-            for i in range(200)
-            for f in udp_frame(bytes([number, i] * 900), f"10.0.0.{number}", ident=i, mtu=1500)
-        ]
-        paths.append(write_pcap(tmp_path / f"{number}.pcap", frames))
-    recordings = [open_capture(p, buffer_bytes=9000, streams=streams) for p in paths]
-    seen: list[Seen] = []
-    for batch in merge(recordings):
-        seen += seen_of(batch, streams)
-    assert [(one.host_ns, one.payload[0], one.payload[1]) for one in seen] == [
-        (i * 1000 + number, number, i) for i in range(200) for number in (1, 2)
-    ]
-    assert [recording.counts.datagrams for recording in recordings] == [200, 200]
-    alone = [one for batch in merge(recordings[:1]) for one in seen_of(batch, streams)]
-    assert alone == seen[::2]
 
 
 # -- captures that follow each other --------------------------------------------------------------

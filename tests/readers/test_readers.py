@@ -15,7 +15,7 @@ import zstandard
 
 from mlbatch.readers import merge, open_recording
 from mlbatch.readers.formats import rosbag2
-from mlbatch.types import CutOff, PacketBatch, StreamTable, WrappedRecording
+from mlbatch.types import CutOff, PacketBatch, StreamTable
 from tests.builders.bags import fixture_messages
 from tests.builders.captures import Packet, Section, pcap_bytes, section_bytes, udp_frame
 from tests.builders.containers import CONTAINERS
@@ -142,16 +142,3 @@ def test_another_thread_goes_on_or_ends(bags: int, tmp_path: Path) -> None:
     assert next(begun, None) is None
     with closing(batches(paths[0])) as again:
         assert len(next(again))
-
-
-def test_a_wrapped_recording_reports_what_its_inner_one_does(tmp_path: Path) -> None:
-    path = tmp_path / "a.pcap"
-    path.write_bytes(CONTENT)
-    inner = open_capture(path)
-    outer = WrappedRecording(inner)
-    read(inner)
-    assert (outer.path, outer.container, outer.notes) == (inner.path, "pcap", [])
-    assert outer.counts is inner.counts
-    assert outer.position_bytes == inner.size_bytes > 0
-    outer.keep = frozenset({"/own"})
-    assert inner.keep == frozenset()

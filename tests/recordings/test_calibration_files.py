@@ -45,12 +45,6 @@ def test_real_files(name: str) -> None:
         assert math.degrees(file.elevation_rad[laser]) == pytest.approx(angle_deg, abs=4e-4)
 
 
-def test_a_real_vlp_32c_has_azimuths() -> None:
-    # rot_correction is minus the manual's offset: +1.4, -4.2 degrees.
-    rot_deg = [math.degrees(angle) for angle in real("vlp32c_ros2/VLP32.yaml").azimuth_rad[:2]]
-    assert rot_deg == pytest.approx([-1.4, 4.2])
-
-
 HESAI_FOLDER = RECORDINGS / "hesai"
 
 # First and last line of the files, as a text editor shows them: elevation, azimuth in deg.

@@ -178,14 +178,6 @@ def test_the_rotor_goes_on_while_beams_fire(case: Case, tmp_path: Path) -> None:
     assert np.abs(moved_deg - (case.offset_ns[on.ring] + lag_ns) * 3600e-9).max() < 0.002
 
 
-def test_the_published_sweep_of_the_xt16_starts_when_the_manual_states(tmp_path: Path) -> None:
-    """The column at exactly 0, which the rule of the clouds still counts to the sweep before."""
-    (case,) = (case for case in CASES if case.folder == "pandarxt16")
-    points = Sorted.of(case, converted(case.bag, tmp_path / "out", *AS_PUBLISHED).cloud)
-    at_zero = np.unique(points.cloud.stamp_ns[points.order][points.cdeg == 0])
-    assert at_zero[1] == 1564027949399730000
-
-
 def test_a_recording_whose_ranges_are_all_one(tmp_path: Path) -> None:
     """Every distance was overwritten with 0x9696 counts of 4 mm, so that every beam has points."""
     bag = FOLDER / "pandar64_all-points" / "all_points"

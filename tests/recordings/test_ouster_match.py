@@ -8,16 +8,11 @@ import numpy as np
 import pytest
 
 from mlbatch.sensors import describe, read_calibration
+from mlbatch.sensors.crc import crc64
 from mlbatch.sensors.ouster.sensor import OusterCalibration
 from mlbatch.types import Stream
 from tests.builders.vendors import beside
-from tests.recordings.ouster import (
-    CASES,
-    ONLY_IMU,
-    OUSTER,
-    Case,
-    evidence,
-)
+from tests.recordings.ouster import CASES, ONLY_IMU, OUSTER, Case, evidence
 
 
 def test_real_packets_equal_the_reference() -> None:
@@ -119,3 +114,15 @@ def test_real_imu_and_zone_packets_are_named() -> None:
     assert describe(452, case.payloads(452)) == f"Ouster IMU, {serial}, 452 bytes"
     assert describe(680, case.payloads(680)) == f"Ouster zone monitor, {serial}, 680 bytes"
     assert describe(48, CASES[0].payloads(48)[:4]) == "Ouster IMU"
+
+
+@pytest.mark.parametrize(
+    ("case", "size", "count"),
+    [(CASES[0], 8448, 34), (CASES[-1], 16640, 1), (ONLY_IMU, 452, 8), (ONLY_IMU, 680, 1)],
+    ids=str,
+)
+def test_checksums_of_recent_firmware(case: Case, size: int, count: int) -> None:
+    packets = case.payloads(size)
+    stated = np.ascontiguousarray(packets[:, -8:]).view("<u8")[:, 0]
+    assert len(packets) == count
+    assert (crc64(packets[:, :-8]) == stated).all()

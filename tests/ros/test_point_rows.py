@@ -68,20 +68,6 @@ def test_rows_are_taken_literally(given_rows: Rows) -> None:
         assert found.fields[role].tobytes() == values.tobytes()
 
 
-def _columns_of(rings: int, columns: int, order: str, random: np.random.Generator) -> Points:
-    """Points of a spinning lidar, some missing: by column, by ring, or in no order."""
-    stamp = np.tile(np.arange(columns) * 48_828, rings)
-    ring = np.repeat(np.arange(rings), columns)
-    keep = random.random(len(stamp)) < 0.9
-    keep[0] = True
-    stamp, ring = stamp[keep], ring[keep]
-    if order != "ring":
-        index = np.argsort(stamp, kind="stable") if order == "column" else None
-        index = random.permutation(len(stamp)) if index is None else index
-        stamp, ring = stamp[index], ring[index]
-    return _points(stamp, ring, random)
-
-
 def _points(
     stamp: npt.NDArray[np.int64], ring: npt.NDArray[np.int64] | None, random: np.random.Generator
 ) -> Points:
@@ -102,16 +88,6 @@ def _assert_equal(points: Points, layout: Layout) -> None:
     assert found.tobytes() == expected.tobytes()
 
 
-@pytest.mark.parametrize("order", ["column", "ring", "none"])
-@pytest.mark.parametrize(("rings", "columns"), [(16, 300), (64, 200), (128, 130), (1, 700)])
-def test_clouds_of_a_spinning_lidar_are_packed_literally(
-    rings: int, columns: int, order: str
-) -> None:
-    points = _columns_of(rings, columns, order, np.random.default_rng(rings + columns))
-    _assert_equal(points, layout_of(points, 0))
-    _assert_equal(points, Layout(0, 7))
-
-
 @settings(max_examples=150)
 @given(
     # Few times, all times, as far apart as those of a cloud can be.
@@ -129,13 +105,6 @@ def test_points_in_any_order_are_packed_literally(
     ring = None if rings is None else random.integers(0, rings, count)
     points = _points(stamp, ring, random)
     _assert_equal(points, layout_of(points, 1) if slots is None else Layout(1, slots))
-
-
-def test_many_short_runs_are_packed_literally() -> None:
-    """More runs than the loops follow at once."""
-    random = np.random.default_rng(1)
-    points = _points(np.tile([3, 2, 1, 0], 400), None, random)
-    _assert_equal(points, Layout(0, 16))
 
 
 def test_times_that_do_not_fit_one_word_with_their_rings_are_packed() -> None:
@@ -165,13 +134,6 @@ def packed(rows: Rows, slots: int) -> PackedRows | None:
     layout = Layout(0, slots, by_ring=True)
     factors = hash_factors(layout.size // 8)
     return RowPacker().pack(rows, stamps, layout, BIG, room, factors)
-
-
-def packed_bytes(rows: Rows, slots: int) -> U8Array:
-    """Packets of rows that are usual."""
-    found = packed(rows, slots)
-    assert found is not None
-    return found.packets
 
 
 def assert_as_literally(rows: Rows, slots: int) -> None:
@@ -272,23 +234,6 @@ def test_a_time_that_only_a_later_ring_has_is_inserted() -> None:
     assert [one.count for one in columns] == [1, 1, 2, 1]
     assert [one.x[:2] for one in columns] == [(1, 0), (0, 3), (2, 4), (0, 5)]
     assert_as_literally(rows, 16)
-
-
-def test_times_of_shots_without_a_place_are_no_columns() -> None:
-    rows = simple([(0, 5, 0), (1, 10, 0), (0, 15, 0), (2, 20, 0), (0, 4_000_000_000, 0)])
-    assert_as_literally(rows, 16)
-    # Times that are wrong where there is no place.
-    assert_as_literally(simple([(1, 10, 0), (0, 0, 0), (2, 20, 0), (0, 7, 0), (3, 30, 1)]), 16)
-
-
-def test_shots_without_a_place_do_not_end_a_run() -> None:
-    """By hand: in the second run the shot at 30 has no place, and 20 comes behind it."""
-    points = [(1, 10, 0), (2, 20, 0), (3, 30, 0), (4, 10, 1), (0, 30, 1), (5, 20, 1), (6, 30, 1)]
-    assert_as_literally(simple(points), 16)
-    # A time that only shots without a place have comes between those of points.
-    points = [(1, 10, 0), (0, 20, 0), (3, 30, 0), (4, 10, 1), (0, 20, 1), (6, 30, 1)]
-    assert_as_literally(simple(points), 16)
-    assert [one.count for one in read_packets(packed_bytes(simple(points), 16))] == [2, 2]
 
 
 def test_times_without_a_value_are_left_out_and_counted() -> None:

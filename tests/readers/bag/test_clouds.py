@@ -14,10 +14,9 @@ from mlbatch.readers.bag.cloud_topics import CloudTopics, cloud_topics
 from mlbatch.readers.bag.clouds import CloudRecording
 from mlbatch.reports.ledger import check_capture
 from mlbatch.types import PacketBatch, Stream, StreamTable, Topic
-from tests.builders.bags import Body, Recorded, packet_message
+from tests.builders.bags import Recorded, packet_message
 from tests.builders.points import (
     CLOUD,
-    CUSTOM2,
     HEAD_BYTES,
     OUSTER,
     STAMP_NS,
@@ -93,15 +92,6 @@ def test_what_is_left_out_is_reported(tmp_path: Path) -> None:
     assert not check_capture(recording.counts)
 
 
-def test_clouds_without_coordinates_give_one_note(tmp_path: Path) -> None:
-    empty = cloud_message(OUSTER, [(0, 0, 0, 9, 5, 1)] * 3)
-    messages = write_points("/points", [empty, cloud_message(OUSTER, [])])
-    recording, _ = _open(_bag(tmp_path, messages))
-    assert list(recording.packets()) == []
-    assert recording.verdicts == ["/points: left out of 3 points: 3 without a place (NaN or zero)"]
-    assert recording.counts.frames == 0
-
-
 def test_rings_beyond_those_of_the_first_cloud_are_reported(tmp_path: Path) -> None:
     sweeps = [
         cloud_message(OUSTER, [(1, 1, 1, 9, 0, ring) for ring in range(first, first + 16)], stamp)
@@ -132,34 +122,14 @@ def test_a_search_for_sensors_packs_first_points_and_the_run_all(tmp_path: Path)
     assert recording.counts.frames == 3 * 256
 
 
-def test_clouds_without_a_place_at_first_are_searched_whole(tmp_path: Path) -> None:
-    points = [
-        (ring > 1, 0, 0, 9, 1000 * column, ring) for ring in range(16) for column in range(256)
-    ]
-    clouds = [cloud_message(OUSTER, points, STAMP_NS + n * 100_000_000) for n in range(2)]
-    recording, _ = _open(_bag(tmp_path, write_points("/points", clouds)))
-    recording.clouds.first_points_only = True
-    assert len(_payloads(recording.packets())) == 2 * 256
-
-
-def test_messages_are_handed_over_where_they_are_asked_for(tmp_path: Path) -> None:
-    text = Recorded("/note", "std_msgs/String", STAMP_NS + 3, Body("cdr").text("hello").done())
-    bag = _bag(tmp_path, [text, *write_points("/points", [_sweep(0)])])
-    recording, _ = _open(bag)
-    for keep in (frozenset[str](), frozenset({"/note"}), frozenset({"/note", "/points"})):
-        recording.keep = keep
-        names = [m.topic.name for batch in recording.packets() for m in batch.messages]
-        assert set(names) == keep
-        assert len(names) == len(keep)
-
-
-def test_raw_packets_keep_their_place_between_clouds(tmp_path: Path) -> None:
+def test_raw_packets_keep_their_place_between_clouds_also_of_many_parts(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     payloads = [bytes([number]) * 40 for number in range(6)]
+    kind = "ouster_sensor_msgs/PacketMsg"
     raw = [
-        Recorded("/os/lidar_packets", "ouster_sensor_msgs/PacketMsg", STAMP_NS + at * 10**7, data)
-        for at, data in zip(
-            (1, 8, 12, 18, 25, 40), (packet_message("cdr", p) for p in payloads), strict=True
-        )
+        Recorded("/os/lidar_packets", kind, STAMP_NS + at * 10**7, packet_message("cdr", data))
+        for at, data in zip((1, 8, 12, 18, 25, 40), payloads, strict=True)
     ]
     clouds = write_points("/points", [_sweep(n) for n in range(3)])
     bag = _bag(tmp_path, sorted([*raw, *clouds], key=lambda message: message.log_ns))
@@ -169,30 +139,12 @@ def test_raw_packets_keep_their_place_between_clouds(tmp_path: Path) -> None:
     assert received_ns == sorted(received_ns)
     number = table.number(Stream(topic="/os/lidar_packets"))
     assert [data for stream, _, data in packets if stream == number] == payloads
-    assert len(packets) == 6 + 9
+    assert len(packets) == recording.counts.datagrams == 6 + 9
     assert not check_capture(recording.counts)
-    assert recording.counts.datagrams == 15
-
-
-def test_large_clouds_come_in_parts_and_lose_nothing(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    raw = [
-        Recorded(
-            "/os/lidar_packets",
-            "ouster_sensor_msgs/PacketMsg",
-            STAMP_NS + at * 10**7,
-            packet_message("cdr", bytes([at]) * 40),
-        )
-        for at in range(5, 60, 5)
-    ]
-    clouds = write_points("/points", [_sweep(n) for n in range(5)])
-    bag = _bag(tmp_path, sorted([*raw, *clouds], key=lambda message: message.log_ns))
-    whole = _payloads(_open(bag)[0].packets())
     monkeypatch.setattr("mlbatch.readers.bag.clouds._BATCH_BYTES", 1)
     batches = list(_open(bag)[0].packets())
-    assert len(batches) > 4
-    assert _payloads(iter(batches)) == whole
+    assert len(batches) > 3
+    assert _payloads(iter(batches)) == packets
 
 
 def test_a_topic_over_several_bags_has_one_layout(tmp_path: Path) -> None:
@@ -208,16 +160,6 @@ def test_a_topic_over_several_bags_has_one_layout(tmp_path: Path) -> None:
     packets = _payloads(merge(recordings))
     assert {len(data) for _, _, data in packets} == {HEAD_BYTES + 2 * 20}
     assert len(packets) == 4
-
-
-def test_topics_of_clouds_are_recognised_by_type() -> None:
-    topics = (
-        Topic("/a", CLOUD, "cdr"),
-        Topic("/b", "sensor_msgs/Imu", "cdr"),
-        Topic("/c", CUSTOM2, "ros1"),
-        Topic("/d", CLOUD, "json"),
-    )
-    assert [topic.name for topic in cloud_topics(topics)] == ["/a", "/c"]
 
 
 # Name, header stamps, frame: made from the clouds of /top/points, where they have its stamps in its

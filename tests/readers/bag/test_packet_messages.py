@@ -160,16 +160,6 @@ def test_payloads_of_every_type_come_out_whole(name: str, encoding: str) -> None
             assert found.untimed == (many and count > 0 and not own)
 
 
-@pytest.mark.parametrize("frame", ["", "a", "ab", "abc", "abcd", "abcde"])
-def test_alignment_follows_the_frame_name(frame: str) -> None:
-    body = Body("cdr").header(STAMP_NS, frame).put("I", 2)
-    for number in range(2):
-        body.time(STAMP_NS + number).raw(bytes([number + 1]) * 1206)
-    found, read_back = find(Topic("/t", "velodyne_msgs/VelodyneScan", "cdr"), body.done())
-    assert read_back == [b"\1" * 1206, b"\2" * 1206]
-    assert found.host_ns.tolist() == [STAMP_NS, STAMP_NS + 1]
-
-
 @pytest.mark.parametrize(("stated", "expected"), [(568, 568), (1500, 1500), (4_000_000_000, 1500)])
 def test_the_size_field_of_a_pandar_packet_limits_its_bytes(stated: int, expected: int) -> None:
     body = Body("cdr").header(0).put("I", 1).time(STAMP_NS).raw(bytes(1500)).put("I", stated)

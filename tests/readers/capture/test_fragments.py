@@ -181,15 +181,6 @@ def test_open_sets_are_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
     assert skipped == {"fragment_lost": 15}
 
 
-def test_large_held_sets_do_not_overflow_the_arena() -> None:
-    # 60 datagrams of 60 kB each wait for their last fragments, which come all at once.
-    sets = [udp_frame(payload(i, 60_000), ident=i, mtu=9000) for i in range(60)]
-    frames = [f for one in sets for f in one[:-1]] + [one[-1] for one in sets]
-    seen, skipped = seen_and_skipped([(0, f) for f in frames], buffer_bytes=50_000)
-    assert [one.payload for one in seen] == [payload(i, 60_000) for i in range(60)]
-    assert skipped == {"fragment": 6 * 60}
-
-
 @settings(max_examples=300)
 @given(
     pieces=st.lists(

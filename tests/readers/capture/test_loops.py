@@ -24,19 +24,6 @@ def test_more_frames_than_there_is_room_for(tmp_path: Path) -> None:
     assert recording.counts.skipped == {"truncated": 40_000}
 
 
-def test_runs_are_copied() -> None:
-    pick = np.random.default_rng(1)
-    source = pick.integers(0, 256, 5000, np.uint8)
-    size = pick.integers(0, 90, 40)
-    start = pick.integers(0, 4900, 40)
-    place = np.cumsum(size) - size
-    out = np.zeros(5000, np.uint8)
-    CaptureLoops().copy_runs(source, start, size, out, place)
-    runs = zip(start.tolist(), size.tolist(), strict=True)
-    copied = b"".join(source[at : at + count].tobytes() for at, count in runs)
-    assert out.tobytes() == copied.ljust(5000, b"\0")
-
-
 def _copy(start: int, size: int, place: int) -> None:
     source, out = np.zeros(100, np.uint8), np.zeros(50, np.uint8)
     first, count, at = (np.array([one]) for one in (start, size, place))

@@ -7,7 +7,6 @@ IPv4), 4213 (IPv6 in IPv4), 2473 (packets in IPv6).
 from __future__ import annotations
 
 import struct
-from pathlib import Path
 
 import pytest
 from hypothesis import given, settings
@@ -19,10 +18,8 @@ from tests.builders.captures import (
     ipv4_packets,
     ipv6_packet,
     link_frame,
-    pcap_bytes,
     udp_frame,
 )
-from tests.builders.reading import open_capture, read
 from tests.readers.capture.test_frames import found, whole
 from tests.reference.capture import Frame
 
@@ -180,10 +177,3 @@ def test_any_damage_is_counted(data: st.DataObject) -> None:
         damaged[data.draw(st.integers(0, len(frame) - 1))] = data.draw(st.integers(0, 255))
         frames.append(whole(bytes(damaged[: data.draw(st.integers(0, len(frame)))]), link))
     assert found(frames, 1) == found(frames, 5)
-
-
-def test_a_capture_of_ppp_is_read(tmp_path: Path) -> None:
-    frames = [(i, b"\xff\x03\x00\x21" + FOUR) for i in range(500)]
-    (tmp_path / "a.pcap").write_bytes(pcap_bytes(frames, linktype=9))
-    seen = read(open_capture(tmp_path / "a.pcap", buffer_bytes=4000))
-    assert [(one.host_ns, one.payload) for one in seen] == [(i, PAYLOAD) for i in range(500)]

@@ -16,11 +16,9 @@ from mcap.writer import Writer
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from mlbatch.types import Message, Topic
-from tests.builders.bags import Body, Recorded, fixture_messages, fixture_packets, packet_message
+from tests.builders.bags import Recorded, fixture_messages, fixture_packets, packet_message
 from tests.builders.mcaps import FORMS, LZ4, NONE, ZSTD, Form, write_mcap
-from tests.builders.reading import RECORDINGS, Seen, open_bag, read, refusal, seen_of
-from tests.builders.rosbag1 import write_rosbag1
+from tests.builders.reading import RECORDINGS, Seen, open_bag, read, refusal
 from tests.builders.rosbag2 import write_folder, write_rosbag2
 from tests.builders.sessions_of_bags import packets_only
 
@@ -191,20 +189,6 @@ def test_a_file_of_nothing(records_given: bytes, tmp_path: Path) -> None:
 
 
 # -- ROS 1 ----------------------------------------------------------------------------------------
-
-
-def test_the_calibration_of_hesai_is_a_message_of_its_own(tmp_path: Path) -> None:
-    text = b"Laser id,Elevation,Azimuth\n"
-    body = Body("ros1").header(0).put("I", 2).time(5).blob(b"\xff\xee12").put("I", 4)
-    body.time(0).blob(b"\x47\x74\x05\x00" + struct.pack(">I", len(text)) + text)
-    message = Recorded("/pandar", "hesai_lidar/PandarScan", 77, body.put("I", len(text)).done())
-    recording = open_bag(write_rosbag1(tmp_path / "a.bag", [message]), keep={"/pandar"})
-    batches = list(recording.packets())
-    seen = [one for batch in batches for one in seen_of(batch, recording.streams)]
-    assert [(one.host_ns, one.payload) for one in seen] == [(5, b"\xff\xee12")]
-    topic = Topic("/pandar", "mlbatch/HesaiCorrection", "bytes")
-    assert batches[-1].messages[-1] == Message(topic, 77, text)
-    assert recording.counts.skipped == {"no_stream": 1}
 
 
 def _encrypted() -> bytes:

@@ -222,22 +222,6 @@ def test_every_form_gives_the_same_scans(shell: Shell, name: str) -> None:
     np.testing.assert_array_equal(_xyz(), [(x, y, z + 1) for x, y, z, *_ in POINTS * SWEEPS])
 
 
-def test_two_lidars_in_folders_of_their_own(shell: Shell) -> None:
-    write_sweeps(Path("drive/a"), _names())
-    write_sweeps(Path("drive/b"), {f"{s + 50 * MS}.bin": raw(FIELDS, POINTS) for s in _starts()})
-    text = f"dtype: {dtype_text(FIELDS)}, from: start"
-    Path("rig.yaml").write_text(
-        f"sensors:\n- {{name: a, points: {{glob: a/*.bin, {text}}}, extrinsics: "
-        f"{{translation_m: [0, 0, 1]}}}}\n- {{name: b, points: {{glob: b/*.bin, {text}}}, "
-        "extrinsics: {translation_m: [0, 0, 2]}}\n"
-    )
-    outcome = shell("convert drive --rig rig.yaml -o out --keep-partial")
-    assert outcome.code == 0, outcome.err
-    assert _columns() == sorted({*EXPECTED, *(stamp + 50 * MS for stamp in EXPECTED)})
-    assert len(_xyz()) == 2 * SWEEPS * COLUMNS * RINGS
-    assert "top" not in shell("inspect drive --rig rig.yaml").out
-
-
 def test_a_file_cut_off_is_counted_and_named(shell: Shell) -> None:
     sweeps = _names()
     last = sorted(sweeps)[-1]
