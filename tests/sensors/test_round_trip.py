@@ -218,9 +218,9 @@ def test_counts_wrap_and_packets_without_are_named_by_content(
 def azimuths_of(spec: SpinningSpec) -> tuple[range, Literal["big", "little"]]:
     """Bytes of the azimuths of blocks, and their order."""
     if isinstance(spec, RobosenseSpec):
-        row = spec.row
-        stride = 4 + 3 * row.slots
-        return range(row.header + 2, row.header + stride * row.blocks, stride), "big"
+        layout = spec.row.layout
+        stride = 4 + 3 * layout.per_block
+        return range(layout.header + 2, layout.header + stride * layout.blocks, stride), "big"
     # A VLS-128 uses eight blocks of a packet with two returns.
     used = 8 if (spec.model, spec.mode) == ("VLS-128", "dual") else 12
     return range(2, 100 * used, 100), "little"

@@ -30,7 +30,6 @@ from mlbatch.simulate.hesai.models import (
     SEQUENCE,
     SIGNATURE,
     SINCE_1900,
-    UNIT_FLAGS,
     HesaiModel,
 )
 from mlbatch.simulate.interface import LidarFiles, LidarModel, LidarSettings, PacketTopic, Sent
@@ -157,7 +156,7 @@ class HesaiSpec(SpinningSpec):
     @property
     def channels(self) -> int:
         """Channels of a block."""
-        return self.row.channels
+        return self.row.row.channels
 
     @property
     def returns(self) -> int:
@@ -238,7 +237,8 @@ class HesaiSpec(SpinningSpec):
     def directions(self, columns: int) -> F64Array:
         """(n, channels, 3) unit vectors at each beam's firing; x right, y forward."""
         rotor = np.repeat(self.azimuths_deg(columns)[:, None], self.channels, axis=1)
-        rotor += (_fired_ns(self, columns) + self.row.azimuth_lag_ns) * (self.rpm * 6e-9)
+        lag_ns = self.row.row.timing.azimuth_ns
+        rotor += (_fired_ns(self, columns) - lag_ns) * (self.rpm * 6e-9)
         azimuth, elevation = (np.radians(angle) for angle in self.beams.aim(rotor))
         flat = np.cos(elevation)
         return np.stack(
@@ -255,6 +255,7 @@ class HesaiSpec(SpinningSpec):
     def encode(self, counts: I64Array, levels: I64Array) -> list[Sent]:
         """Packets of these columns; what a silent beam is given is left out."""
         row = self.row
+        lead, azimuth_at = row.row.lead, row.row.azimuth_at
         columns = len(counts)
         packets = columns // self.columns_per_packet
         if counts.shape != self.shape(packets):
@@ -263,15 +264,16 @@ class HesaiSpec(SpinningSpec):
         units = np.rint(self.azimuths_deg(columns) * row.units_per_deg).astype(np.int64)
         # The AT128's finer azimuth: two bytes of 1/100 deg, then one of 1/25600.
         coarse, fine = np.divmod(units, row.units_per_deg // 100)
-        blocks[..., :2] = np.frombuffer(row.block_flag or bytes(2), np.uint8)
-        blocks[..., row.azimuth_at : row.azimuth_at + 2] = _bytes_of(coarse, "<u2")[:, None]
-        if row.lead == 3:
+        # Before the azimuth is the flag of a block.
+        blocks[..., :azimuth_at] = np.frombuffer(b"\xff\xee"[:azimuth_at], np.uint8)
+        blocks[..., azimuth_at : azimuth_at + 2] = _bytes_of(coarse, "<u2")[:, None]
+        if lead == 3:
             blocks[..., 2] = fine[:, None]
         fired = self.fires(columns)[:, :, None]
-        body = blocks[..., row.lead :].reshape(columns, self.returns, row.channels, row.unit)
+        body = blocks[..., lead:].reshape(columns, self.returns, self.channels, row.unit)
         body[..., :2] = _bytes_of(np.where(fired, counts, 0).transpose(0, 2, 1), "<u2")
         body[..., 2] = np.where(fired, levels, 0).transpose(0, 2, 1)
-        blocks[..., row.lead :] = body.reshape(columns, self.returns, -1)
+        blocks[..., lead:] = body.reshape(columns, self.returns, -1)
         bodies = blocks.reshape(packets, -1)
         assemble = _jt16 if self.model == "JT16" else _assembled
         said_ns = _packet_times_ns(self, packets)
@@ -287,14 +289,8 @@ class HesaiSpec(SpinningSpec):
 def _row(model: str, operation: str, flags: int | None) -> HesaiModel:
     """Return the layout of a model with what a spec chooses."""
     row = MODELS[model]
-    slower = row.operations and operation != HIGH
-    own_flags = row.flags if flags is None else flags
-    return replace(
-        row,
-        step_ns=row.step_ns * (2 if slower else 1),
-        flags=own_flags,
-        unit=row.unit + (row.grows and (own_flags & UNIT_FLAGS).bit_count()),
-    )
+    number = OPERATIONS[operation][0] if row.operations else 0
+    return replace(row, flags=row.flags if flags is None else flags, operation=number)
 
 
 def _packet_times_ns(spec: HesaiSpec, packets: int) -> I64Array:
@@ -307,16 +303,16 @@ def _packet_times_ns(spec: HesaiSpec, packets: int) -> I64Array:
 
 def _block_times_ns(spec: HesaiSpec, columns: int) -> I64Array:
     """(n,) packet time and offset of the block, by section 5."""
-    row = spec.row
+    timing, step_ns = spec.row.row.timing, spec.row.step_ns
     groups = spec.columns_per_packet
     packet, group = np.divmod(np.arange(columns), groups)
-    if row.counts_back:
+    if timing.counts_back:
         # (last block - b) // returns; the blocks of a group give the same.
-        offsets = [-int(row.step_ns * (groups - 1 - one)) for one in range(groups)]
+        offsets = [-int(step_ns * (groups - 1 - one)) for one in range(groups)]
     else:
-        offsets = [int(row.step_ns * one) for one in range(groups)]
+        offsets = [int(step_ns * one) for one in range(groups)]
     times = _packet_times_ns(spec, -(-columns // groups))
-    block_ns: I64Array = times[packet] + row.first_ns + np.array(offsets)[group]
+    block_ns: I64Array = times[packet] + timing.base_ns + np.array(offsets)[group]
     return block_ns
 
 
@@ -353,7 +349,7 @@ def _assembled(spec: HesaiSpec, number: int, time_ns: int, body: bytes) -> bytes
     elif head:
         head[4:6] = bytes([spec.returns > 1, row.unit_mm])
     parts = [bytes(head), body]
-    if row.checked:
+    if row.row.has_checks:
         parts.append(_crc(body))
         if spec.has(SAFETY):
             safety = bytes([0x20, 0, *bytes(10)])
@@ -363,28 +359,31 @@ def _assembled(spec: HesaiSpec, number: int, time_ns: int, body: bytes) -> bytes
         end += struct.pack("<I", (spec.sequence + number) % 2**32)
     if spec.has(IMU):
         end += bytes(22)
-    parts += [end, _crc(end) if row.checked else b""]
+    parts += [end, _crc(end) if row.row.has_checks else b""]
     return b"".join([*parts, _SIGNATURE if spec.has(SIGNATURE) else b""])
 
 
 def _tail(spec: HesaiSpec, number: int, time_ns: int) -> bytes:
-    place = spec.row.tail
-    tail = bytearray(spec.row.tail.size)
-    tail[place.mode] = MODES[spec.mode][0]
-    tail[place.factory] = 0x42
-    # JT128 counts in 0.1 rpm.
-    struct.pack_into("<h", tail, place.speed, spec.rpm * spec.row.speed_units_per_rpm)
-    if place.date:
-        tail[place.date : place.date + 6] = date_field(time_ns, spec.row.date)
-    struct.pack_into("<I", tail, place.micros, time_ns // 1000 % 1_000_000)
-    if place.loop:
-        tail[place.loop] = (number * spec.columns_per_packet + 1) % 2
-    if spec.row.operations:
-        tail[place.operation], states = OPERATIONS[spec.operation]
-        first = number * spec.columns_per_packet
-        fields = [(first + block // spec.returns) % states for block in range(spec.row.blocks)]
-        state = sum(one << (14 - 2 * block) for block, one in enumerate(fields))
-        struct.pack_into("<H", tail, place.state, state)
+    place = spec.row.row.tail
+    tail = bytearray(place.size)
+    first = number * spec.columns_per_packet
+    states = OPERATIONS[spec.operation][1]
+    each = [(first + block // spec.returns) % states for block in range(spec.row.blocks)]
+    state = sum(one << 14 >> 2 * block for block, one in enumerate(each))
+    # The factory byte follows the time, and a mode that is there.
+    factory_at = place.us_at + 4 + (place.mode_at == place.us_at + 4)
+    for at, form, value in (
+        (place.mode_at, "B", MODES[spec.mode][0]),
+        (factory_at, "B", 0x42),
+        (place.rpm_at, "<h", round(spec.rpm / place.rpm_step)),
+        (place.date_at, "6s", date_field(time_ns, spec.row.date)),
+        (place.us_at, "<I", time_ns // 1000 % 1_000_000),
+        (place.loop_at, "B", (first + 1) % 2),
+        (place.operation_at, "B", spec.row.operation),
+        (place.states_at, "<H", state),
+    ):
+        if at is not None:
+            struct.pack_into(form, tail, at, value)
     return bytes(tail)
 
 

@@ -23,7 +23,6 @@ from mlbatch.simulate.robosense.models import (
     EARLY,
     MODELS,
     STRONGEST,
-    AngleLayout,
     RobosenseModel,
 )
 from mlbatch.simulate.spinning import SpinningSpec, simulator
@@ -130,7 +129,8 @@ class RobosenseSpec(SpinningSpec):
     @property
     def columns_per_packet(self) -> float:
         """Half of a packet's columns may be the rest of a dual one of 128 lines."""
-        return self.row.blocks * self.row.slots / (self.channels * self.returns)
+        layout = self.row.layout
+        return layout.blocks * layout.per_block / (self.channels * self.returns)
 
     @property
     def device_period_ns(self) -> int:
@@ -148,12 +148,12 @@ class RobosenseSpec(SpinningSpec):
 
         RS-16 has no azimuths of its own.
         """
-        row = self.row
-        unit = row.angles.unit_deg
+        offsets = self.row.row.angles
+        unit = offsets.unit_deg
         number = np.arange(self.channels)
-        even = np.linspace(*row.span_deg, self.channels)
+        even = np.linspace(*self.row.span_deg, self.channels)
         counts = np.rint(even / unit) + number * 5 % 7
-        pattern = (number * 3 % 8 - 3.5) * 1.04 if row.angles.azimuth_at else 0.0
+        pattern = (number * 3 % 8 - 3.5) * 1.04 if offsets.azimuth_at else 0.0
         azimuth = np.rint(pattern / unit) * unit * np.ones(self.channels)
         return Angles(np.asarray(counts * unit, np.float64), azimuth)
 
@@ -199,24 +199,23 @@ class RobosenseSpec(SpinningSpec):
 
     def encode(self, counts: I64Array, levels: I64Array) -> list[Sent]:
         """Packets of these columns, in their order."""
-        row = self.row
-        blocks, rest = divmod(counts.size, row.slots)
-        packets = blocks // row.blocks
-        if rest or packets * row.blocks != blocks or counts.shape[2] != self.returns:
+        layout = self.row.layout
+        blocks, rest = divmod(counts.size, layout.per_block)
+        packets = blocks // layout.blocks
+        if rest or packets * layout.blocks != blocks or counts.shape[2] != self.returns:
             raise ValueError(f"{counts.shape} readings are no whole packets of {self}")
-        block = np.zeros((packets, row.blocks), _block(row.slots))
-        block["id"] = np.frombuffer(row.block_id.ljust(2, b"\0"), np.uint8)
-        if len(row.block_id) == 1:
+        block = np.zeros((packets, layout.blocks), _block(layout.per_block))
+        block["id"] = np.frombuffer(layout.block_id.ljust(2, b"\0"), np.uint8)
+        if len(layout.block_id) == 1:
             block["id"][..., 1] = (np.arange(blocks) % self.returns + 1).reshape(block.shape)
         block["azimuth"] = _block_azimuths(self, blocks).reshape(block.shape)
         reading = block["reading"]
         flag = _AIRY_FLAG if self.is_airy else 0
         reading["range"] = _as_blocks(counts + flag).reshape(reading.shape)
         reading["level"] = _as_blocks(levels).reshape(reading.shape)
-        payloads = np.zeros((packets, row.size), np.uint8)
-        end = row.header + row.blocks * block.itemsize
-        payloads[:, row.header : end] = block.view(np.uint8).reshape(packets, -1)
-        if len(row.block_id) == 2 and row.blocks == 12:
+        payloads = np.zeros((packets, self.row.size), np.uint8)
+        payloads[:, layout.header : layout.end] = block.view(np.uint8).reshape(packets, -1)
+        if len(layout.block_id) == 2 and layout.blocks == 12:
             payloads[:, -2:] = 0, 0xFF
         return _sent(self, payloads)
 
@@ -228,7 +227,7 @@ class RobosenseSpec(SpinningSpec):
     ) -> bytes:
         """A DIFOP packet; angles: of another unit; parts: bytes to put in last."""
         row = self.row
-        layout = row.angles
+        offsets = row.row.angles
         own = angles or self.angles
         view = (round(degrees * 100) % 36001 for degrees in self.view_deg)
         fields = {
@@ -242,11 +241,11 @@ class RobosenseSpec(SpinningSpec):
             # gPTP, locked by PTP.
             300: bytes((row.modes[self.mode], 3, 2)),
             303: _time(self, self.start_ns + after_ns),
-            layout.elevation_at: _angles(own.elevation_deg, layout, signed=layout.sign_bytes),
+            offsets.elevation_at: _angles(row, own.elevation_deg, signed=offsets.signed),
             1246: b"\x0f\xf0",
         }
-        if layout.azimuth_at:
-            fields[layout.azimuth_at] = _angles(own.azimuth_deg, layout, signed=True)
+        if offsets.azimuth_at:
+            fields[offsets.azimuth_at] = _angles(row, own.azimuth_deg, signed=True)
         if self.is_reversed:
             fields[337] = b"\x01"
         if self.is_airy:
@@ -304,13 +303,13 @@ def _as_blocks(values: I64Array) -> I64Array:
 def _first_columns(spec: RobosenseSpec, columns: int) -> I64Array:
     """First column of the packet in which each column begins."""
     readings = spec.channels * spec.returns
-    per_packet = spec.row.slots * spec.row.blocks
+    per_packet = spec.row.layout.per_block * spec.row.layout.blocks
     return np.arange(columns) * readings // per_packet * per_packet // readings
 
 
 def _block_azimuths(spec: RobosenseSpec, blocks: int) -> I64Array:
     """0.01 degrees, where the rotor is when a block's first column begins."""
-    column = np.arange(blocks) * spec.row.slots // (spec.channels * spec.returns)
+    column = np.arange(blocks) * spec.row.layout.per_block // (spec.channels * spec.returns)
     azimuth = spec.start_deg + _rounds(spec, column) * _step_deg(spec)
     counts: I64Array = np.rint(azimuth * 100).astype(np.int64)
     return counts % 36000
@@ -331,14 +330,15 @@ def _sent(spec: RobosenseSpec, payloads: U8Array) -> list[Sent]:
     ):
         fields = {
             **row.marks,
-            row.time_at: _time(spec, spec.start_ns + first_round * spec.round_ns),
+            row.layout.time_at: _time(spec, spec.start_ns + first_round * spec.round_ns),
         }
         if row.counter_at:
             fields[row.counter_at] = struct.pack(">I", (spec.first_counter + number) % 2**32)
         if row.range_step_at:
             fields[row.range_step_at] = b"\x01" if spec.range_unit_m == 0.0025 else b"\x00"
-        if row.wave_modes is not None:
-            fields[row.wave_modes[0]] = bytes((row.wave_modes[spec.returns],))
+        if row.layout.modes is not None:
+            codes = {returns: code for code, returns in row.layout.modes.items()}
+            fields[row.layout.mode_at] = bytes((codes.get(spec.returns, 0),))
         for at, part in fields.items():
             payload[at : at + len(part)] = np.frombuffer(part, np.uint8)
         end_ns = spec.start_ns + (last_round + 1) * spec.round_ns
@@ -349,21 +349,21 @@ def _sent(spec: RobosenseSpec, payloads: U8Array) -> list[Sent]:
 def _time(spec: RobosenseSpec, time_ns: int) -> bytes:
     """Ten bytes, cut to whole us."""
     second, micro = divmod(time_ns // 1000, 1_000_000)
-    if not spec.row.is_calendar:
+    if not spec.row.row.is_calendar:
         return second.to_bytes(6, "big") + struct.pack(">I", micro)
     moment = _EPOCH + timedelta(seconds=second)
     date = (moment.year - 2000, moment.month, moment.day, moment.hour, moment.minute, moment.second)
     return bytes(date) + struct.pack(">2H", *divmod(micro, 1000))
 
 
-def _angles(angles_deg: F64Array, layout: AngleLayout, *, signed: bool) -> bytes:
+def _angles(row: RobosenseModel, angles_deg: F64Array, *, signed: bool) -> bytes:
     """Three bytes per channel: sign and size, or size alone; FF where a slot has no channel."""
-    counts = np.rint(angles_deg / layout.unit_deg).astype(np.int64).tolist()
+    counts = np.rint(angles_deg / row.row.angles.unit_deg).astype(np.int64).tolist()
     if signed:
         written = [bytes((count < 0,)) + struct.pack(">H", abs(count)) for count in counts]
     else:
         written = [abs(count).to_bytes(3, "big") for count in counts]
-    return b"".join(written + [_UNWRITTEN] * (layout.slots - len(written)))
+    return b"".join(written + [_UNWRITTEN] * (row.angle_slots - len(written)))
 
 
 LIDARS = tuple(
