@@ -18,7 +18,6 @@ from mlbatch.native.library import Group, Scan, address, library
 from mlbatch.reports.ledger import PointCounts
 from mlbatch.types import PACKED_ROOM, PackedTotals, RecordLayout, WindowColumns
 
-_UNSURE = np.float32(2)
 # Columns of an organized scan that are packed together: slots of several columns are adjacent in
 # the output, and all of them fit into the second-level cache.
 _NEAR_COLUMNS = 16
@@ -168,10 +167,10 @@ class Engine:
     def _angles(self, sensor: I64Array, encoder: I64Array) -> list[F32Array]:
         """Return cosines and sines of all columns; undefined for sensors without rotor words."""
         if self._turns.all():
-            return list(compiled_angles(encoder))
+            return list(rotor_angles(encoder))
         angles = np.zeros((2, len(encoder)), np.float32)
         turning = self._turns[sensor]
-        angles[:, turning] = compiled_angles(encoder[turning])
+        angles[:, turning] = rotor_angles(encoder[turning])
         for number in self._is_mirrored.nonzero()[0]:
             own = sensor == number
             angles[:, own] = self._groups[self._group_of[number]].mirror_angles(
@@ -198,13 +197,3 @@ class Engine:
         scan.label = address(out.label)
         scan.range_m = address(out.range_m) if wants_range else None
         scan.reflectivity = address(out.reflectivity) if wants_reflectivity else None
-
-
-def compiled_angles(words: I64Array) -> tuple[F32Array, F32Array]:
-    """Return the result of `rotor_angles` for rotor words (n,), equal to the last bit."""
-    words = np.ascontiguousarray(words)
-    cosine, sine = np.empty((2, len(words)), np.float32)
-    if library().mlbatch_angles(len(words), address(words), address(cosine), address(sine)):
-        unsure = cosine == _UNSURE
-        cosine[unsure], sine[unsure] = rotor_angles(words[unsure])
-    return cosine, sine

@@ -17,7 +17,7 @@
 #endif
 
 /* To be changed with every change of a struct or of a signature. */
-#define MLBATCH_ABI 16
+#define MLBATCH_ABI 17
 
 #if defined(_WIN32)
 #define EXPORT __declspec(dllexport)
@@ -492,7 +492,6 @@ static inline int64_t mlbatch_content_key(const uint8_t *packet, int64_t bytes,
 
 EXPORT int64_t mlbatch_abi(void);
 EXPORT int64_t mlbatch_decode(const Scan *scan);
-EXPORT int64_t mlbatch_angles(int64_t count, const int64_t *words, float *cosine, float *sine);
 EXPORT int64_t mlbatch_merge(int64_t part_count, const Part *parts, int64_t until_ns,
                              int64_t *taken, int64_t *stamp_ns, int64_t *sensor,
                              int64_t *ring_index, int64_t *encoder);
@@ -523,8 +522,6 @@ EXPORT int64_t mlbatch_cloud_points(int64_t count, const uint8_t *rows, int64_t 
                               const int64_t *real_at, const int64_t *real_type, int64_t time_type,
                               int64_t fields, const int64_t *field_at, const int64_t *field_bytes,
                               int64_t room, float *reals, uint8_t *const *out, int64_t *placed);
-EXPORT int64_t mlbatch_cloud_order(int64_t count, const int64_t *stamp_ns, const uint16_t *ring,
-                             uint64_t *words, uint64_t *spare, int64_t *order);
 EXPORT int64_t mlbatch_cloud_columns(int64_t count, const int64_t *stamp_ns, const uint16_t *ring,
                                const int64_t *order, int64_t slots, int64_t by_ring,
                                int32_t *column, uint16_t *slot);

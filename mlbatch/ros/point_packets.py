@@ -205,23 +205,13 @@ class _Placed(NamedTuple):
 
 def _placed(points: Points, layout: Layout) -> _Placed:
     """Points by stamp, then ring, then message order, in columns."""
-    loops = library()
     count = len(points)
     stamp_ns = np.ascontiguousarray(points.stamp_ns)
     ring = None if points.ring is None else np.ascontiguousarray(points.ring)
-    order: I64Array | None = np.empty(count, np.int64)
-    words, spare = np.empty((2, count), np.uint64)
-    state = loops.mlbatch_cloud_order(
-        count, address(stamp_ns), _address(ring), address(words), address(spare), _address(order)
-    )
-    if state < 0:
-        # Stamps so far apart that no word takes them with ring and number.
-        order = np.lexsort((np.zeros(count) if ring is None else ring, stamp_ns))
-    elif state:
-        order = None
+    order = _order(stamp_ns, ring)
     column = np.empty(count, np.int32)
     slot: U16Array = np.empty(count, np.uint16)
-    columns = loops.mlbatch_cloud_columns(
+    columns = library().mlbatch_cloud_columns(
         count,
         address(stamp_ns),
         _address(ring),
@@ -232,6 +222,30 @@ def _placed(points: Points, layout: Layout) -> _Placed:
         address(slot),
     )
     return _Placed(columns, column, slot, order)
+
+
+def _order(stamp_ns: I64Array, ring: U16Array | None) -> I64Array | None:
+    """Numbers of points by stamp, then ring, then their order; None if they are in this order."""
+    falls = stamp_ns[1:] < stamp_ns[:-1]
+    if ring is not None:
+        falls |= (stamp_ns[1:] == stamp_ns[:-1]) & (ring[1:] < ring[:-1])
+    if not falls.any():
+        return None
+    low_ns = int(stamp_ns.min())
+    ring_bits = 0 if ring is None else int(ring.max()).bit_length()
+    number_bits = len(stamp_ns).bit_length()
+    key_bits = (int(stamp_ns.max()) - low_ns).bit_length() + ring_bits
+    if key_bits + number_bits > 64:
+        # Stamps so far apart that no word takes them with ring and number.
+        keys = (stamp_ns,) if ring is None else (ring, stamp_ns)
+        return np.asarray(np.lexsort(keys), np.int64)
+    # Stamp, ring and number in one word: all differ, so that the fastest sort is a stable one.
+    words = (stamp_ns - low_ns).astype(np.uint64) << np.uint64(ring_bits)
+    if ring is not None:
+        words |= ring
+    words = words << np.uint64(number_bits) | np.arange(len(words), dtype=np.uint64)
+    words.sort()
+    return np.asarray(words & np.uint64((1 << number_bits) - 1), np.int64)
 
 
 def _address(array: npt.NDArray[Any] | None) -> int | None:
