@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import re
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -24,43 +23,6 @@ def test_synchronised_clocks_need_no_warning(shell: Shell) -> None:
     for sensor in report["sensors"]:
         assert sensor["clock"]["epoch"] == "utc"
         assert abs(sensor["clock"]["offset_to_host_ms"]) < 5
-
-
-# 512 columns a revolution of 0.1 s, 16 a packet: the newest column is 15 / 16 of 3.125 ms after the
-# first one, the packet is received 4.125 ms after that, always: 1.195 ms after its newest column.
-BEHIND_MS = -(4.125 - 3.125 * 15 / 16)
-
-
-def test_one_clock_has_one_offset(shell: Shell, tmp_path: Path) -> None:
-    """The envelope's in the report, its notes, the page, errors, table and JSON of inspect."""
-    one = Unit(turns=12)
-    write_session(tmp_path, one)
-    outcome = shell("convert drive.pcap -o out --format npz --html page.html")
-    assert outcome.code == 0, outcome.err
-    (sensor,) = json.loads((tmp_path / "out" / "report.json").read_text())["sensors"]
-    assert sensor["clock"]["offset_to_host_ms"] == pytest.approx(BEHIND_MS, abs=1e-3)
-    texts = {
-        "notes": sensor["clock"]["notes"][-1],
-        "page": (tmp_path / "page.html").read_text(encoding="utf-8"),
-        "table": shell("inspect drive.pcap").out,
-    }
-    for name, text in texts.items():
-        assert "-1.195 ms" in text, name
-        # The first column's, of the first packet.
-        assert "4.125" not in text, name
-    (stream,) = json.loads(shell("inspect drive.pcap --json").out)["streams"]
-    assert stream["offset_ms"] == pytest.approx(BEHIND_MS, abs=1e-3)
-    tai = replace(one, host_ns=0).ahead(37 * NS_PER_S)
-    write_session(tmp_path, one, twin(tai, 222))
-    said = shell("convert drive.pcap --dry-run --identity-extrinsics").err
-    # This one without the millisecond of the network.
-    assert "-0.001 s for ouster_111 and +37.000 s for ouster_222" in said
-
-
-def test_the_offset_of_receive_times_is_none(shell: Shell, tmp_path: Path) -> None:
-    write_session(tmp_path, Unit(turns=12))
-    (sensor,) = shell.dry("drive.pcap --clock host")["sensors"]
-    assert sensor["clock"]["offset_to_host_ms"] == 0
 
 
 def test_drift_is_told(shell: Shell, tmp_path: Path) -> None:

@@ -12,16 +12,13 @@ import mlbatch
 from tests.builders.mcaps import write_mcap
 from tests.builders.run import command
 from tests.builders.sessions import (
-    EPOCH_NS,
     FIX,
     FIXTURE,
-    NS_PER_MS,
     NS_PER_S,
     Report,
     Shell,
     Unit,
     arrays,
-    names,
     report_of,
     twin,
     write_session,
@@ -30,10 +27,7 @@ from tests.builders.sessions_of_bags import unit_messages
 from tests.builders.transcripts import transcripts
 
 CASES = transcripts("outputs", FIX="fix/two_lidars.pcap --rig fix/rig.yaml")
-# From fixtures/two_lidars/SOURCE.md.
-T_INIT_NS = 1777881600_100_000_000
 POINTS = 27998
-HEAD_POINTS = 22440
 
 
 @pytest.fixture(scope="module")
@@ -118,37 +112,6 @@ def test_boxes_add_to_those_of_the_rig(shell: Shell) -> None:
     assert all(sensor["points"]["box"] > 7 * 763 for sensor in second["sensors"])
 
 
-def test_partial_windows_and_slices_have_their_own_names(shell: Shell) -> None:
-    shell(f"convert {FIX} -o plain --keep-partial")
-    windows = [f"{index:06d}" for index in range(8)]
-    assert names("plain") == [f"{name}.npz" for name in [*windows, "head"]]
-    head = arrays("plain/head.npz")
-    assert (int(head["index"]), bool(head["complete"]), len(head["xyz"])) == (
-        -1,
-        False,
-        HEAD_POINTS,
-    )
-    shell(f"convert {FIX} -o sliced --keep-partial --slices 4")
-    # The first stamps are 22 ms after the second: all slices of the head have columns.
-    whole = [f"{name}-{j}.npz" for name in [*windows[:7], "head"] for j in range(4)]
-    # The last stamps are 69 ms into window 7.
-    assert names("sliced") == sorted([*whole, *(f"000007-{j}.npz" for j in range(3))])
-    last = arrays("sliced/head-3.npz")
-    assert (int(last["index"]), int(last["slice"]), int(last["slices"])) == (-1, 3, 4)
-    assert int(last["start_ns"]) == T_INIT_NS - 25 * NS_PER_MS
-    assert int(last["end_ns"]) == T_INIT_NS
-
-
-def test_host_clock_makes_uptime_clocks_comparable(shell: Shell, tmp_path: Path) -> None:
-    one = Unit(begin_ns=50 * NS_PER_S, host_ns=EPOCH_NS)
-    two = twin(replace(one, begin_ns=7000 * NS_PER_S, host_ns=EPOCH_NS - 6950 * NS_PER_S), 222)
-    capture = write_session(tmp_path, one, two)
-    report = shell.dry(f"{capture} --identity-extrinsics --clock host")
-    assert report["timescale"] == "utc"
-    assert [sensor["clock"]["source"] for sensor in report["sensors"]] == ["host", "host"]
-    assert report["scans"]["written"] == 2
-
-
 def test_a_terminal_obeys_no_topic(shell: Shell, tmp_path: Path) -> None:
     write_mcap(tmp_path / "drive.mcap", unit_messages(Unit(turns=3), "a\x1b[31m\x07\n"))
     outcome = shell("convert drive.mcap -o out -v")
@@ -175,20 +138,3 @@ def test_the_only_scan_is_a_file(shell: Shell, place: Path, tmp_path: Path, suff
     assert (shell(line).code, shell(f"{line} --overwrite -q").out) == (1, "")
     again = mlbatch.convert(one, tmp_path / "again.mcap")
     assert again.report.scans.points == third.point_count
-
-
-@pytest.mark.parametrize(("turns", "first_ns", "scans"), [(1, 20, 2), (1, 0, 1), (2, 20, 1)])
-def test_short_recordings_give_partial_scans(
-    shell: Shell, tmp_path: Path, turns: int, first_ns: int, scans: int
-) -> None:
-    """Of one revolution of 100 ms, in two windows or in one, all; of two with a whole window it."""
-    unit = Unit(turns=turns, begin_ns=EPOCH_NS + first_ns * NS_PER_MS)
-    drive = write_session(tmp_path / "in", unit)
-    done = shell(f"convert {drive} -o {tmp_path / 'out'} -q")
-    assert done.code == 0
-    assert ("warning: short: no whole window of 100 ms" in done.err) == (turns == 1)
-    found = list(mlbatch.read(tmp_path / "out"))
-    assert len(found) == scans
-    assert [one.complete for one in found] == [turns == 2] * scans
-    # 512 columns of 16 beams per revolution.
-    assert sum(one.point_count for one in found) == 512 * 16

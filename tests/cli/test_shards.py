@@ -12,7 +12,6 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-import numpy as np
 import pytest
 from rosbags.highlevel import AnyReader
 
@@ -164,40 +163,6 @@ def test_transcript(shell: Shell, parts: list[str], tmp_path: Path, name: str) -
     CASES[name].check(shell, tmp_path)
 
 
-def test_parts_of_other_recordings_are_refused(shell: Shell) -> None:
-    write_recordings(Path(), turns=6)
-    shutil.copytree("session", "other")
-    with Path("other/drive.pcap").open("r+b") as file:
-        file.seek(-40, os.SEEK_END)
-        file.write(b"\0" * 8)
-    words = "--identity-extrinsics -q"
-    assert shell(f"convert session/drive.pcap {words} --shard 1/2 -o part1").code == 0
-    assert shell(f"convert other/drive.pcap {words} --shard 2/2 -o part2").code == 0
-    outcome = _merged(shell, ["part1", "part2"])
-    assert outcome.code == 2
-    begin = "mlbatch: error: part2: expected the job of part1, found recording 1 'drive.pcap ("
-    assert outcome.err.startswith(begin)
-
-
-def test_parts_of_other_poses_in_a_long_trajectory_are_refused(shell: Shell) -> None:
-    """One pose of a file of 8 MB differs: 5 m instead of 0 m at 4 s after the first scan."""
-    assert shell(f"convert {FIX} -o usual -q").code == 0
-    with np.load("usual/000000.npz") as scan:
-        begin_s = int(scan["start_ns"]) // 10**9 - 1
-    comments = f"# {'-' * 97}\n" * 40_000
-    still = "0 0 0 0 0 0 1"
-    poses = [f"{begin_s + n // 20}.{n % 20 * 5:02d} {still}\n" for n in range(101)]
-    for number, last in enumerate((poses[-1], poses[-1].replace(f" {still}", " 5" + still[1:])), 1):
-        text = comments + "".join(poses[:-1]) + last + comments
-        Path("drive.tum").write_text(text, encoding="utf-8")
-        words = f"{FIX} --deskew drive.tum --shard {number}/2 -o part{number} -q"
-        assert shell(f"convert {words}").code == 0
-    outcome = _merged(shell, ["part1", "part2"])
-    assert outcome.code == 2
-    begin = "mlbatch: error: part2: expected the job of part1, found trajectory"
-    assert outcome.err.startswith(begin)
-
-
 def test_points_that_no_scan_has_are_refused(shell: Shell, parts: list[str]) -> None:
     path = Path("part2/shard.json")
     account = json.loads(path.read_text())
@@ -223,33 +188,6 @@ def test_files_elsewhere_are_not_taken(shell: Shell, parts: list[str], name: str
     assert outcome.err.startswith(begin)
 
 
-def test_a_clock_step_is_the_error_of_one_run(shell: Shell) -> None:
-    write_recordings(Path(), turns=6)
-    whole = shell("convert jumps/drive.pcap -o out")
-    shard = shell("convert jumps/drive.pcap -o part --shard 1/2")
-    assert (shard.code, shard.err) == (whole.code, whole.err)
-    assert shard.code == 1
-    assert not Path("part").exists()
-
-
-@pytest.mark.parametrize("reason", ["no points of a sensor", "no points at all"])
-def test_what_is_wrong_with_the_points_of_all_scans(shell: Shell, reason: str) -> None:
-    """An error of merge as of one run: with --strict, or without any point."""
-    for file in FIXTURE.iterdir():
-        shutil.copy(file, ".")
-    words = "two_lidars.pcap --rig rig.yaml --exclude-box=-1000,-1000,-1000,1000,1000,1000"
-    if reason == "no points of a sensor":
-        text = Path("rig.yaml").read_text().replace("left\n", "left\n    max_range_m: 0.01\n", 1)
-        Path("rig.yaml").write_text(text)
-        words = "two_lidars.pcap --rig rig.yaml --strict"
-    folders = _shards(shell, words, 2)
-    one_run = shell(f"convert {words} -o one")
-    outcome = _merged(shell, folders)
-    assert (outcome.code, outcome.err) == (one_run.code, one_run.err)
-    assert outcome.code == 1
-    assert os.listdir("merged") == []
-
-
 def test_an_output_that_another_run_writes_is_refused(shell: Shell, parts: list[str]) -> None:
     Path("merged/out.partial").mkdir(parents=True)
     with Path("merged/out.partial/files.jsonl").open("a") as held:
@@ -266,21 +204,15 @@ def test_an_output_that_another_run_writes_is_refused(shell: Shell, parts: list[
 def test_the_bag_of_a_shard_can_be_read(shell: Shell) -> None:
     """By the library `rosbags`: metadata.yaml names the files that are there."""
     words = f"{FIX} {BAG} 0.2"
-    whole, _ = _whole(shell, words)
     _shards(shell, words, 2)
     with AnyReader([Path("part2")]) as reader:
         topics = [one.topic for one, _, _ in reader.messages()]
     # Windows 2, 3 and 6 of 7.
     assert topics.count("/points") == 3
-    # Under another name it is merged.
-    Path("part1").rename("other")
-    assert _merged(shell, ["other", "part2"]).code == 0
-    assert contents(Path("merged")) == whole
 
 
 def test_counts_of_the_report_are_those_of_all_shards(shell: Shell, parts: list[str]) -> None:
     accounts = [json.loads(Path(one, "shard.json").read_text()) for one in parts]
-    before = {path: path.read_bytes() for path in Path().glob("part*/*")}
     assert _merged(shell, parts).code == 0
     report = json.loads(Path("merged/out/report.json").read_text())
     for number, sensor in enumerate(report["sensors"]):
@@ -288,10 +220,6 @@ def test_counts_of_the_report_are_those_of_all_shards(shell: Shell, parts: list[
         assert all(own)
         assert sensor["points"]["written"] == sum(own)
     assert report["timing"]["cpu_s"] > sum(one["report"]["timing"]["cpu_s"] for one in accounts)
-    commands = report["command"].split(" && ")
-    assert [words.split()[1] for words in commands] == ["convert", "convert", "merge"]
-    # The parts are kept.
-    assert {path: path.read_bytes() for path in Path().glob("part*/*")} == before
 
 
 def test_another_file_system_gets_copies(
@@ -304,41 +232,6 @@ def test_another_file_system_gets_copies(
     monkeypatch.setattr(os, "link", other)
     assert _merged(shell, parts).code == 0
     assert contents(Path("merged")) == whole
-
-
-@pytest.mark.parametrize("base", [Path(), Path("..")])
-def test_symbolic_links_of_a_part_are_not_taken_over(
-    shell: Shell, parts: list[str], base: Path
-) -> None:
-    """The output has the files themselves, also where links are relative to the part."""
-    files = {path.name: path.read_bytes() for path in Path().glob("part*/*.npz")}
-    Path("linked").mkdir()
-    for path in Path("part1").iterdir():
-        target = base / path if base.parts else path.absolute()
-        (Path("linked") / path.name).symlink_to(target)
-    merged = _merged(shell, ["linked", "part2"])
-    assert merged.code == 0, merged.err
-    shutil.rmtree("linked")
-    shutil.rmtree("part1")
-    found = list(Path("merged/out").glob("*.npz"))
-    assert not any(path.is_symlink() for path in found)
-    assert {path.name: path.read_bytes() for path in found} == files
-
-
-def test_copies_of_a_recording_are_the_same_recording(shell: Shell) -> None:
-    for name in ("one", "two"):
-        Path(name).mkdir()
-        shutil.copyfile(FIXTURE / "two_lidars.pcap", f"{name}/two_lidars.pcap")
-    os.utime("two/two_lidars.pcap", (1, 1))
-    for number, name in enumerate(("one", "two"), 1):
-        words = FIX.replace("fix/two_lidars.pcap", f"{name}/two_lidars.pcap")
-        assert shell(f"convert {words} --shard {number}/2 -o part{number} -q").code == 0
-    whole, _ = _whole(shell, FIX)
-    assert _merged(shell, ["part1", "part2"]).code == 0
-    merged = contents(Path("merged"))
-    assert {k: v for k, v in merged.items() if not k.endswith("report.json")} == {
-        k: v for k, v in whole.items() if not k.endswith("report.json")
-    }
 
 
 # -- interrupted ------------------------------------------------------------------------------
