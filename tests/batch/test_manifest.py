@@ -9,9 +9,11 @@ import pytest
 from mlbatch.batch.identity import session_key
 from mlbatch.batch.manifest import Common, chosen, sessions_of
 from mlbatch.batch.session import Option, Session
-from mlbatch.errors import MlbatchError, RigError, UsageError
+from mlbatch.errors import MlbatchError, UsageError
 from mlbatch.pipeline.job import Shard
 from mlbatch.rig.recipes import FOLDER
+from tests.builders.sessions import Shell
+from tests.builders.transcripts import transcripts
 
 SENSOR = "sensors: [{name: a, stream: {port: 7502}}]\n"
 SWEEPS = "sensors: [{name: a, points: {glob: top/*.bin, dtype: {x: f4, y: f4, z: f4, t: u4}}}]\n"
@@ -197,64 +199,13 @@ def test_files_that_are_no_recordings_are_left_out_with_a_line(tmp_path: Path) -
     assert lines[1].endswith(f"manifest.yaml:2: sessions[0].glob: {expected}")
 
 
-ONE = "sessions: [{name: b7, inputs: [a.pcap]}]\n"
-NO_RIG = "sessions[0].rig: expected the rig of session b7, found no file DIR/raw/rig.yaml; correct"
-# A manifest after its schema, and a part of the message.
-MISTAKES = {
-    "unknown key": ("session: []\nsessions: []\n", "nearest known key is sessions"),
-    "unknown option": ("options: {rat: 1}\nsessions: []\n", "nearest known key is rate"),
-    "glob and inputs": ("sessions: [{glob: x, inputs: [y]}]\n", "glob and inputs"),
-    "neither": ("sessions: [{name: x}]\n", "glob and inputs"),
-    "no inputs": ("sessions: [{inputs: []}]\n", "list of recordings"),
-    "no sessions": ("sessions: []\n", "a list of sessions, found an empty one; add one"),
-    "nothing matches": ('sessions: [{glob: "nothing/*"}]\n', "found none"),
-    "no recording": (
-        'sessions: [{glob: "raw/*.json"}]\n',
-        "recordings or folders, found none for ",
-    ),
-    "no recording in folders": (FOLDERS, "found none; check the pattern, or give the rig that"),
-    "unknown field": ('sessions: [{glob: "*.yaml", name: "{date}"}]\n', "{folder}"),
-    "unknown field of a rig": (f'rig: "{{dir}}/r.yaml"\n{FOLDERS}', "found {dir}"),
-    "no rig": ("sessions: [{name: b7, inputs: [a.pcap], rig: raw/rig.yaml}]\n", NO_RIG),
-    "rig and dataset": (f"rig: r.yaml\ndataset: mcd\n{ONE}", "a dataset or a rig, found both"),
-    "no dataset": (
-        "sessions: [{inputs: [a.pcap], dataset: mdc}]\n",
-        "sessions[0].dataset: expected the name of a dataset, found 'mdc'; the nearest are mcd",
-    ),
-    "a dataset that is refused": (f"dataset: lyft\n{ONE}", "its points have no time"),
-    "slash in a name": ("sessions: [{name: a/b, inputs: [x]}]\n", "folder name"),
-    "dots": ('sessions: [{name: "..", inputs: [x]}]\n', "folder name"),
-    "the same name": ("sessions: [{inputs: [a/x.pcap]}, {inputs: [b/X.pcap]}]\n", "different"),
-    "a rule without a choice": (f"rigs: [{{rig: a.yaml}}]\n{ONE}", "sessions, from or until"),
-    "no day": (f"rigs: [{{from: 2024-02-30, rig: a.yaml}}]\n{ONE}", "a date as 2024-05-31"),
-    "days exchanged": (
-        f"rigs: [{{from: 2024-03-01, until: 2024-02-01, rig: a.yaml}}]\n{ONE}",
-        "exchange them",
-    ),
-    "no date in a name": (
-        f"rigs: [{{from: 2024-03-01, rig: a.yaml}}]\n{ONE}",
-        "name of session b7",
-    ),
-    "no rule fits": (f"rigs: [{{sessions: a*, rig: a.yaml}}]\n{ONE}", "no rule that fits it"),
-    "a limit without a unit": (
-        f"limits: {{time: 30}}\n{ONE}",
-        "limits.time: expected a limit as 2 h, 90 min or 30 s",
-    ),
-    "a limit of nothing": (f"limits: {{disk: 0 GB}}\n{ONE}", "50 GB"),
-    "bad without a reason": (f"known_bad: [b7]\n{ONE}", "sessions with reasons"),
-    "an unknown bad one": (f"known_bad: {{b8: rain}}\n{ONE}", "name of a session, found 'b8'"),
-    "no flag": ("options: {split: maybe}\nsessions: []\n", "true or false"),
-}
+MISTAKES = transcripts("manifests")
 
 
 @pytest.mark.parametrize("name", MISTAKES)
-def test_mistakes_are_one_line(name: str, tmp_path: Path) -> None:
-    text, message = MISTAKES[name]
+def test_mistake(shell: Shell, tmp_path: Path, name: str) -> None:
     touch(tmp_path, "raw/left.json raw/one/top/17.bin")
-    with pytest.raises((RigError, UsageError)) as caught:
-        read(tmp_path, text)
-    assert message.replace("DIR", str(tmp_path)) in str(caught.value)
-    assert "expected" in str(caught.value)
+    MISTAKES[name].check(shell, tmp_path)
 
 
 def test_a_manifest_needs_its_schema(tmp_path: Path) -> None:

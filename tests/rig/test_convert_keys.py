@@ -109,45 +109,6 @@ def test_a_written_trajectory_is_relative_to_the_new_rig_file(tmp_path: Path) ->
     assert Path(found.values[0]).resolve() == (tmp_path / "drive" / "poses.tum").resolve()
 
 
-MISTAKES = [
-    (
-        "convert:\n  job: 4\n",
-        ":3: convert.job: expected a key of decode, identity_extrinsics, ",
-    ),
-    ("convert:\n  job: 4\n", ", found 'job'; the nearest known key is jobs"),
-    ("convert: {rate: 20}\n", "found 'rate'; the nearest known key is "),
-    ("convert: 4\n", ":2: convert: expected a mapping with keys of "),
-    (
-        "convert: {jobs: 0}\n",
-        ":2: convert.jobs: expected a whole number from 1 to 64, found '0'; ",
-    ),
-    ("convert: {jobs: many}\n", ":2: convert.jobs: expected a finite number, found 'many'; "),
-    ("convert: {split: 1}\n", ":2: convert.split: expected true or false, found '1'; "),
-    (
-        "convert: {layout: flat}\n",
-        ":2: convert.layout: expected dense or organized, found 'flat'; use one of these words",
-    ),
-    (
-        "convert: {drop_incomplete: 101}\n",
-        ":2: convert.drop_incomplete: expected a number from 0 to 100, found '101'; ",
-    ),
-    ("convert: {min_range: -1}\n", ":2: convert.min_range: expected a number 0 or more, "),
-    ("convert: {only: {a: b}}\n", ":2: convert.only: expected text, or a list of texts, "),
-    ("convert: {decode: crc}\n", ":2: convert.decode: expected a mapping of options, "),
-    ("convert: {format: }\n", ":2: convert.format: expected text, found nothing; "),
-]
-
-
-@pytest.mark.parametrize(("section", "message"), MISTAKES)
-def test_mistakes_name_file_line_and_key(tmp_path: Path, section: str, message: str) -> None:
-    with pytest.raises(RigError) as raised:
-        _read(tmp_path, section)
-    text = str(raised.value)
-    assert text.startswith(str(tmp_path / "rig.yaml"))
-    assert message in text
-    assert "\n" not in text
-
-
 def test_written_options_are_read_back(tmp_path: Path) -> None:
     options = (
         RigOption("compression", ("zstd:3",)),

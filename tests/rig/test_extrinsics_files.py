@@ -304,57 +304,6 @@ def test_metres_stated_as_millimetres_are_refused(
 
 
 X = "sensors[0].extrinsics"
-MISTAKES = [
-    ("{file: none.yaml}", ".file: expected an existing file, found none at"),
-    ("{file: []}", ".file: expected one or more files, found a list of 0; give a file"),
-    ("{file: red.yaml}", ": expected a frame of the file as body_frame, one of body, lidar_red ("),
-    ("{file: red.yaml, frame: lidar_blue, parent: body}",
-     "expected a frame of the file as frame, one of body, lidar_red ("),
-    ("{file: red.yaml, matrix: [[1]]}", "expected file without matrix, found matrix as well"),
-    ("{frame: a, key: T, direction: body_from_sensor}", "expected key without frame, found frame"),
-    ("{file: opencv.yaml, key: body_T_lidar}", "expected key with direction, found no direction"),
-    ("{file: opencv.yaml, direction: body_from_sensor}",
-     "expected direction with key, found no key"),
-    ("{direction: body_from_sensor, key: a}", "expected direction with file, found no file"),
-    ("{file: opencv.yaml, key: body_T_lidr, direction: body_from_sensor}",
-     ": expected the key body_T_lidr in one file ("),
-    ("{file: opencv.yaml, key: twice, direction: body_from_sensor}",
-     "twice: expected a matrix of 4 x 4, 3 x 4, 3 x 3, 3 x 1, found the key twice (first on line "
-     "19)"),
-    ("{file: opencv.yaml, key: short, direction: body_from_sensor}",
-     "opencv.yaml:21: short.data: expected 16 numbers, found a list of 3; give all 16 and no more"),
-    ("{file: opencv.yaml, key: [turn, shift], direction: body_from_sensor}",
-     "shift: expected a translation (3 x 1) before its rotation (3 x 3) in `key`, found it after"),
-    ("{file: opencv.yaml, key: body_T_lidar, direction: sideways}",
-     ".direction: expected body_from_sensor or sensor_from_body, found 'sideways'"),
-    ("{file: opencv.yaml}",
-     ": expected TransformStamped (header.frame_id, child_frame_id, transform), "
-     "Ouster (transforms with source_frame, destination_frame, p_x), "
-     "Autoware (parent: {child: {x, y, z, roll, pitch, yaw}}), found keys body_T_lidar, "),
-    ("{file: [kit.yaml, sensors.yaml]}",
-     ": expected the key frame, since the file has 3 of them ("),
-    ("{file: sensors.yaml, frame: velodyne_top_base_link, parent: sensor_kit_base_link}",
-     ": expected sensor_in_frame, as velodyne_top_base_link is the mounting face of the housing "
-     "and not the frame of the points ("),
-    ("{file: [kit.yaml, red.yaml], frame: lidar_red}",
-     ": expected frames that connect base_link with lidar_red ("),
-    ("{file: extrinsic_parameters.json, parent: world}",
-     ": expected the key frame, since the file has 2 of them ("),
-    ("{file: extrinsic_parameters.json, frame: 992313000353}",
-     ": expected a frame of the file as body_frame, one of 122150000150, 992313000353, world ("),
-]  # fmt: skip
-
-
-@pytest.mark.parametrize(("text", "expected"), MISTAKES, ids=[text for text, _ in MISTAKES])
-def test_errors_of_rigs(folder: Path, text: str, expected: str) -> None:
-    with pytest.raises(RigError) as caught:
-        _pose(folder, text)
-    message = str(caught.value)
-    assert message.startswith(f"{folder / 'rig.yaml'}:3: {X}") or "/opencv.yaml:" in message
-    assert expected in message
-    assert "\n" not in message
-
-
 BROKEN = [
     ("red.yaml", "w: 0.70", "w: 0.30",
      "8: transform.rotation: expected a quaternion of norm 1 within 0.001, found norm 0.7"),

@@ -16,9 +16,8 @@ from mlbatch.errors import RigError
 from mlbatch.rig.rig import read_rig
 from mlbatch.rig.schema import rig_schema
 from tests.builders.sessions import REPOSITORY, Shell
-from tests.rig.test_convert_keys import MISTAKES as CONVERT_MISTAKES
 from tests.rig.test_convert_keys import SENSORS
-from tests.rig.test_mistakes import MISTAKES, VALID, one
+from tests.rig.test_mistakes import CASES, VALID
 from tests.rig.test_rig import FULL
 
 PAGES = (REPOSITORY / "README.md", *sorted((REPOSITORY / "docs").rglob("*.md")))
@@ -99,13 +98,19 @@ BEYOND = (
     *("at most 10000 m", "quaternion of norm", "orthonormal", "determinant", "as last row"),
     "y0 < y1",
 )
+RIG = re.compile(r"printf '%b' '(.*)' > rig.yaml")
 REFUSED = [
-    *(text for text, message in MISTAKES if not any(words in message for words in BEYOND)),
-    *(SENSORS + section for section, _ in CONVERT_MISTAKES),
+    rig[1].replace("'\\''", "'").encode().decode("unicode_escape")
+    for case in CASES.values()
+    if (rig := RIG.fullmatch(case.steps[0].words))
+    and "extrinsics: {file" not in rig[1]
+    and not any(words in case.steps[1].lines[0] for words in BEYOND)
+]
+REFUSED += [
     SENSORS + "convert: {jobs: 1.5}\n",
-    one("extrinsics: known"),
-    one("stream: {port: 0}"),
-    one("clock: {offset_s: 5000000000}"),
+    "sensors: [{name: left, extrinsics: known}]\n",
+    "sensors: [{name: left, stream: {port: 0}}]\n",
+    "sensors: [{name: left, clock: {offset_s: 5000000000}}]\n",
 ]
 
 
