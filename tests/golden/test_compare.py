@@ -6,7 +6,6 @@ to its last, without the duration of the last: 100 ms / 512.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -129,38 +128,13 @@ def test_a_silent_lidar_pollutes_joined_turns(found: dict[str, Comparison]) -> N
     assert ours.without_a_sensor == 29
 
 
-def test_the_tables_of_the_page_come_from_these_runs(found: dict[str, Comparison]) -> None:
-    """README shows the first of them, too."""
-    page = PAGE.read_text(encoding="utf-8")
-    for table in (_spans_table(found), _losses_table(found)):
-        assert table in page, f"put this into {PAGE.name}:\n{table}"
-
-
-def _spans_table(found: dict[str, Comparison]) -> str:
-    return _table("time span of a set, ms", found, _span)
-
-
-def _losses_table(found: dict[str, Comparison]) -> str:
-    return _table("what else", found, _losses)
-
-
-def _table(title: str, found: dict[str, Comparison], cell: Callable[[PolicyFigures], str]) -> str:
-    rows = [[title, *POLICIES], ["---"] * (1 + len(POLICIES))]
-    rows += [[case, *map(cell, one.reports)] for case, one in found.items()]
-    return "\n".join(f"| {' | '.join(row)} |" for row in rows)
+def test_the_table_of_the_page_comes_from_these_runs(found: dict[str, Comparison]) -> None:
+    rows = [["time span of a set, ms", *POLICIES], ["---"] * (1 + len(POLICIES))]
+    rows += [[case, *map(_span, one.reports)] for case, one in found.items()]
+    table = "\n".join(f"| {' | '.join(row)} |" for row in rows)
+    assert table in PAGE.read_text(encoding="utf-8"), f"put this into {PAGE.name}:\n{table}"
 
 
 def _span(report: PolicyFigures) -> str:
     low, high = (f"{value:.0f}" for value in _spans_ms(report))
     return low if low == high else f"{low} to {high}"
-
-
-def _losses(report: PolicyFigures) -> str:
-    share = 100 * report.never_used / report.columns
-    parts = [
-        f"{report.without_a_sensor} sets of one lidar" if report.without_a_sensor else "",
-        f"{report.stale} stale" if report.stale else "",
-        # Less than a sweep or two: the ends of the recording.
-        f"{share:.0f} % of the columns unused" if share > 1 else "",
-    ]
-    return ", ".join(filter(None, parts)) or "-"
