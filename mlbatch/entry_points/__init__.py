@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 READERS = "mlbatch.readers"
 SENSORS = "mlbatch.sensors"
 WRITERS = "mlbatch.writers"
-# Names that a module of each group must define; the interfaces: docs/plugins.md.
+# Names that a module of each group must define; the interfaces: docs/extend.md.
 _REQUIRED = {
     READERS: ("CONTAINER", "recognises", "open_packets"),
     SENSORS: ("VENDOR", "MODELS", "BUILT_IN", "read_calibration", "describe"),

@@ -104,7 +104,10 @@ class Calibration(ABC):
 
     @abstractmethod
     def match_score(self, evidence: Evidence) -> int:
-        """Score the match with packets: 0: none; larger: more certain; see NAMED_ONLY."""
+        """Score the match with packets: 0: none, 100: a built-in one that they name, 200: a file.
+
+        Negative: see NAMED_ONLY.
+        """
 
     @abstractmethod
     def lidar(self, options: Mapping[str, str], evidence: Evidence | None) -> Lidar:

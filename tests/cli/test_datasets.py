@@ -172,10 +172,8 @@ def _row(name: str) -> str:
     facts = recipe(name)
     if facts.refused:
         return f"| {facts.title} | `{name}` | {facts.refused} |"
-    command = f"mlbatch convert {facts.recording} --dataset {name} -o scans.mcap"
-    open_facts = f"Not verified: {', '.join(facts.not_verified)}." if facts.not_verified else ""
-    text = " ".join(filter(None, [facts.remarks, open_facts]))
-    return f"| {facts.title} | {facts.data}: {facts.lidars} | `{command}` | {facts.mark} | {text} |"
+    cells = (facts.title, f"`{name}`", f"`{facts.recording}`", f"{facts.data}: {facts.lidars}")
+    return f"| {' | '.join((*cells, facts.mark, facts.remarks))} |"
 
 
 def test_the_tables_of_the_page_are_those_of_the_recipes() -> None:

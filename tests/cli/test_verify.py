@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import json
-import re
 from pathlib import Path
 
 import numpy as np
 
 from mlbatch.cli.verify import SHOWN
-from mlbatch.outputs.kinds import FILE_FORMATS
 from mlbatch.verification import CHECKS
 from tests.builders.run import ROOT, command
 from tests.builders.verify_outputs import Arrays, arrays, copied, made
@@ -77,17 +75,3 @@ def test_the_page_names_every_check() -> None:
     rows = [line.split("|")[1] for line in page.splitlines() if line.startswith("| `")]
     named = [name.strip(" `") for row in rows for name in row.split(",")]
     assert named == list(CHECKS)
-
-
-def test_the_page_names_the_limits_of_each_format() -> None:
-    page = (ROOT / "docs" / "verify.md").read_text(encoding="utf-8")
-    table = page.partition("## What is checkable in each format")[2]
-    rows = re.findall(r"^\| (.+?) \| (.+) \|$", table, re.MULTILINE)
-    of_row = {name: set(re.findall(r"`(\w+)`", text)) for name, text in rows}
-    _, first, second, *_ = of_row
-    for form in FILE_FORMATS:
-        (named,) = (of_row[row] for row in of_row if form.name in row.lower())
-        # Other rows add to the first two.
-        if form.name not in first:
-            named = named | of_row[first] | of_row[second]
-        assert set(form.limits) <= named, form.name

@@ -1,4 +1,4 @@
-"""docs/python.md and docs/plugins.md name what the interface has (test_blocks.py runs them)."""
+"""docs/python.md and docs/extend.md name what the interface has (test_blocks.py runs them)."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from tests.builders.sessions import FIXTURE
 from tests.contract.tree import ROOT
 
 PAGE = (ROOT / "docs" / "python.md").read_text(encoding="utf-8")
-PLUGINS = (ROOT / "docs" / "plugins.md").read_text(encoding="utf-8")
+EXTEND = (ROOT / "docs" / "extend.md").read_text(encoding="utf-8")
 
 
 @pytest.mark.parametrize("name", sorted(set(mlbatch.__all__) - {"MlbatchError", "Run", "Scan"}))
@@ -25,7 +25,7 @@ def test_every_name_is_described(name: str) -> None:
 
 
 def test_the_example_of_a_package_is_that_of_the_page() -> None:
-    (block,) = re.findall(r"^```toml\n(.*?)^```$", PLUGINS, re.MULTILINE | re.DOTALL)
+    (block,) = re.findall(r"^```toml\n(.*?)^```$", EXTEND, re.MULTILINE | re.DOTALL)
     project = ROOT / "examples" / "mlbatch-example" / "pyproject.toml"
     assert block in project.read_text(encoding="utf-8")
 
