@@ -50,7 +50,7 @@ class Option:
 
 @dataclass(frozen=True, slots=True)
 class Limits:
-    """What a session may take; None: no limit. disk_bytes: of its folder, unfinished files too."""
+    """Limits of a session, None: no limit; disk_bytes: of its folder, with unfinished files."""
 
     time_s: float | None = None
     disk_bytes: float | None = None

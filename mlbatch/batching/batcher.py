@@ -470,10 +470,7 @@ class Batcher:
         return merged
 
     def _cuts(self, stamp_ns: I64Array) -> list[tuple[int, int, int]]:
-        """Windows of columns (n,): number, column after the last, end; those without are left out.
-
-        end: ns, of the window.
-        """
+        """Cut sorted stamps (n,) into windows: number, column after the last, end in ns of each."""
         cuts = []
         done = 0
         while done < len(stamp_ns):

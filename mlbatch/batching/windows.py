@@ -36,7 +36,7 @@ class Limit:
 
 @dataclass(slots=True)
 class Coverage:
-    """What the scans of an earlier run cover in time, as far as they were read.
+    """The time that the scans of an earlier run cover, as far as they were read.
 
     begin_ns: start of the first scan, 0 before it; end_ns: of the last; gaps: (begin, end) of
     incomplete and absent ones, neighbours joined.

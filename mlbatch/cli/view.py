@@ -79,7 +79,7 @@ with_parameters(view, (parameter(options.BY_NAME[name]) for name in OPTIONS))
 def _source(
     paths: list[Path], values: dict[str, Any]
 ) -> tuple[Callable[[], Iterator[Scan]], int | None, Job | None]:
-    """What begins to give scans, their number if it is known, and the job of recordings."""
+    """Return a function that starts the scans, their number if known, and the job of recordings."""
     from mlbatch.outputs.read import read
     from mlbatch.outputs.run_files import RunFiles, is_output
 

@@ -1,7 +1,7 @@
 """Do the poses of lidars agree with the gravity that their own IMUs measure in the first seconds?
 
 A pose of another mount or vehicle turns gravity away from the vertical of the body. The vertical
-is z, upward, unless the name of the body frame ends as ROS says of others (REP 103).
+is z, upward, unless the name of the body frame states another (REP 103).
 """
 
 from __future__ import annotations

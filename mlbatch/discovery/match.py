@@ -154,7 +154,7 @@ def _other_size(table: StreamTable, lidar: Lidar, kind: PacketKind) -> list[str]
 def senders(sampler: Sampler) -> set[str]:
     """Names of the built-in vendors that may have sent packets of a recording.
 
-    Built-in calibrations of others match none of them.
+    Built-in calibrations of other vendors match none of them.
     """
     return {
         name

@@ -379,7 +379,7 @@ class _Run:
         if stored.complete is not None:
             row["complete"] = stored.complete
         empty: dict[str, Any] = {name: np.zeros(0, kind) for name, kind in POINT_ARRAYS.items()}
-        # Those that no sensor may have.
+        # Arrays that outputs may lack for all sensors.
         empty |= {"reflectivity": None, "range_m": None}
         return Scan(
             info=self._info_of(frame_id, stored.organized),

@@ -30,7 +30,7 @@ Clouds = Sequence[F32Array]
 
 @dataclass(frozen=True, slots=True)
 class _Cut:
-    """What a picture shows: axes across and up, and the axis of the slab; centre (3,), m."""
+    """A picture of a slab: its axes across, up and through the slab; centre (3,), m."""
 
     title: str
     axes: tuple[int, int, int]

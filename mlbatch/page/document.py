@@ -258,7 +258,7 @@ def lacking(absent: frozenset[str]) -> list[str]:
 
 
 def kept_words(cloud: PageCloud) -> str:
-    """What a page has of its scans."""
+    """Words for the share of points that a page has of its scans."""
     return "all their points" if cloud.stride == 1 else f"every {_ordinal(cloud.stride)} column"
 
 
@@ -344,7 +344,7 @@ def _clock(sensor: SensorReport, recorded_s: float) -> tuple[str, ...]:
 
 
 def _sender(stream: Unassigned) -> str:
-    """What a stream of no sensor is; of unknown packets what their port is for."""
+    """Words for a stream of no sensor; for unknown packets the service of their port."""
     port = re.search(r"port (\d+)", stream.stream)
     service = SERVICES.get(int(port[1])) if port else None
     return stream.what.replace("unknown", service, 1) if service else stream.what

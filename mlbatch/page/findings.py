@@ -335,7 +335,7 @@ def _clocks(report: RunReport) -> Iterator[Finding]:
 
 
 def _poses(report: RunReport) -> Iterator[Finding]:
-    """What lidars see in common; wrong poses that were given have a warning."""
+    """Findings of the pose check; wrong poses with a warning `pose` are left to that."""
     pairs = () if report.poses is None else report.poses.pairs
     has_warning = any(one.code == "pose" for one in report.warnings)
     for pair in pairs:

@@ -24,7 +24,7 @@ MEANINGS = {
     "bad_stamp": "bad timestamp",
     "duplicate": "duplicate",
 }
-# What a run took.
+# Costs of a run.
 COSTS = {
     "wall_s": "total, s",
     "cpu_s": "processor, s",

@@ -218,7 +218,7 @@ class CloudTimes:
     def _keys(
         self, lidar: _Lidar, order: OrderFit, reference: _Lidar, delay: DelayFit | None
     ) -> dict[str, str]:
-        """What to write in the rig so that the times are read as they fit, by lidar and key."""
+        """Keys of the rig that read the times as they fit, by lidar and key."""
         origin = self._origin(lidar.sensor)
         name = lidar.sensor.name
         sweep_s = order.sweep_s

@@ -95,7 +95,7 @@ class Stages:
 
 
 class PacketUser(Protocol):
-    """What decodes columns of windows after the loop has gone on."""
+    """A stage that decodes columns of windows while the main loop continues."""
 
     def oldest_ring_index(self, sensor: int) -> int | None:
         """First ring index of a sensor that is still needed; None: none."""

@@ -63,7 +63,7 @@ class DecodeWorker:
     def __init__(
         self, sources: Sequence[Source], split: bool, new: NewDecoder, counts_clipped: bool
     ) -> None:
-        """split: one decoder a sensor, since each task then is of one sensor.
+        """split: one decoder per sensor, since each task has one sensor.
 
         counts_clipped: the output has intensities of 8 bits.
         """

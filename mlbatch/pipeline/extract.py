@@ -56,7 +56,7 @@ _KIND_BITS = 17
 
 @dataclass(frozen=True, slots=True)
 class Extraction:
-    """What to extract: start, end: by receive time; `from_t_init` counts from the first packet.
+    """A request of `extract`; start, end: receive times, `from_t_init` after the first packet.
 
     duration_ns: instead of an end; passed: patterns of topics to copy.
     """

@@ -35,7 +35,7 @@ _SAMPLE = 16
 
 
 class Use(Enum):
-    """What packets of a lidar are for."""
+    """Purpose of packets of a lidar."""
 
     LIDAR = "lidar"
     IMU = "imu"

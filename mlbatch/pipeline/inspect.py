@@ -463,7 +463,7 @@ def _refuse_damaged(discovery: Discovery) -> None:
 
 
 def _notes(discovery: Discovery) -> Iterator[str]:
-    """Damage, times of decoded clouds, calibrations, contradictions, shared addresses, lidars."""
+    """Notes on damage, times of clouds, calibrations, contradictions, shared addresses, lidars."""
     for recording in discovery.recordings:
         for text in recording.notes:
             yield f"{recording.path.name}: {text}"

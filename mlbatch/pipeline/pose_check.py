@@ -24,8 +24,8 @@ if TYPE_CHECKING:
     from mlbatch.poses.check import Begun, PoseComparison
     from mlbatch.poses.solve import Cloud
 
-# Of a lidar in a window of the first place, and of others: if all is clear, and if more points pay.
-# Of more, every second column is read, or every third.
+# Most slots of a lidar in a window of the first place, and of later places: if all is clear, and
+# if more points pay. Of more, every second column is read, or every third.
 _FIRST_SLOTS, _FEW_SLOTS, _MANY_SLOTS = 1 << 14, 1 << 13, 1 << 15
 # Points (n, 3) of a lidar in a window or slice, and their stamps (n,).
 _Points: TypeAlias = tuple[F64Array, I64Array]
@@ -81,7 +81,7 @@ class PoseCheck:
         return self._is_over
 
     def figures(self) -> PoseFigures:
-        """What is known of each pair of lidars."""
+        """Return the outcome for each pair of lidars."""
         if self._comparison is None or not self._comparison.places:
             return PoseFigures("fewer than three windows")
         return PoseFigures(pairs=self._comparison.figures())

@@ -147,7 +147,7 @@ class Calibration:
     imus: tuple[ImuRotation, ...] = ()
 
     def title(self) -> str:
-        """What the poses come from, in a line."""
+        """One line on the source of the poses."""
         source = (
             f"{self.places} places, measured on {self.held_out} others, of {self.windows} windows"
         )
@@ -190,7 +190,7 @@ class Calibration:
         return [head, *rows] if rows else []
 
     def notes(self) -> list[str]:
-        """What is not known of IMUs, and what the IMU of the first lidar says of its pose."""
+        """Refusals of IMUs, and the tilt of the first lidar by its IMU."""
         refused: dict[str, list[str]] = {}
         for imu in self.imus:
             if imu.refusal:
@@ -296,7 +296,7 @@ def _measured(
     *,
     delays: bool,
 ) -> Calibration:
-    """What was found from a guess, measured on the places that were left out."""
+    """Return the poses found from a guess, measured on the places that were left out."""
     fitted, held_out = places.fitted(), places.held_out()
     _refuse_unseen(found, names)
     _refuse_undetermined(found, names, delays=delays)
@@ -594,7 +594,7 @@ def _delays(
 ) -> Iterator[tuple[str, float, float, bool]]:
     """Delay and standard deviation of each lidar but the first, s, and whether it is proven.
 
-    share: of what proves it.
+    share: of the deviations that a proof needs.
     """
     sigma_s = np.sqrt(np.diag(found.covariance))[6::7]
     delay_s = found.state.delay_s[1:]
@@ -620,7 +620,7 @@ def _refuse_undetermined(found: Solution, names: Sequence[str], *, delays: bool)
 
 
 def _open_directions(weak: F64Array, names: Sequence[str], each: int) -> list[str]:
-    """What directions of the poses (u, w) move, in words: by axes of the body, if they can be."""
+    """Words for directions of the poses (u, w): by axes of the body, if they can be."""
     # How much of each axis lies in the directions.
     share = (weak**2).sum(axis=1)
     axes = np.eye(len(weak))[share > _IN_DIRECTIONS]
@@ -630,7 +630,7 @@ def _open_directions(weak: F64Array, names: Sequence[str], each: int) -> list[st
 
 
 def _direction(axis: F64Array, names: Sequence[str], each: int) -> str:
-    """What a direction of the poses (u,) moves, in words."""
+    """Words for a direction of the poses (u,)."""
     parts = axis.reshape(-1, each)
     lidar = int(np.argmax((parts**2).sum(axis=1)))
     shift, turn = parts[lidar, :3], parts[lidar, 3:6]
@@ -653,7 +653,7 @@ def _axis(vector: F64Array) -> str:
 
 
 def _record_instead(directions: Sequence[str]) -> str:
-    """What to record so that directions are fixed."""
+    """Advice which scene to record so that directions are fixed."""
     needed = {
         "a shift along z": "a floor that both see",
         "a shift": "a corner, a wall across, a stop at a junction",

@@ -71,7 +71,7 @@ _FITS = 0.8
 # Turns by which what is 10 m away moves as far, as in `solve`.
 _LEVER_M = 10.0
 _SCALE = np.array([1.0, 1.0, 1.0, _LEVER_M, _LEVER_M, _LEVER_M])
-# What is not modelled: standard deviations are never smaller.
+# Least standard deviations, for errors that are not modelled.
 _FLOOR_M = 0.001
 _FLOOR_RAD = float(np.deg2rad(0.005))
 _COARSE, _MIDDLE, _ = LEVELS
@@ -119,7 +119,7 @@ class _Shared(NamedTuple):
 
 
 class Begun(NamedTuple):
-    """A place of which the first window is there: its motion, planes and what lidars share."""
+    """A place with its first window only: motion, planes, and surfaces that lidars share."""
 
     first: Place
     state: State
@@ -157,7 +157,7 @@ class PoseComparison:
         self._tries_others = tries_others
         self._pairs = list(combinations(range(len(names)), 2))
         self._shared = [_Shared(0, 0, 0)] * len(self._pairs)
-        # Places so far, of which some have nothing in common.
+        # Places so far; in some of them lidars have nothing in common.
         self.places = 0
         self._places: list[Place] = []
         self._rows: list[Rows] = []
@@ -234,7 +234,7 @@ class PoseComparison:
         return Problem([clouds], len(self._names)).planes(0, state, self._level[0])
 
     def _count(self, surfaces: Sequence[Sequence[Planes]]) -> list[_Shared]:
-        """What each two lidars share in a window."""
+        """Surfaces that each two lidars share in a window."""
         counted = self._level[1]
         return [
             _Shared.of(surfaces[one][counted], surfaces[other][counted])
@@ -280,7 +280,7 @@ class PoseComparison:
         return estimate(problem, rows, state, most_sigma_m=_MOST_SIGMA_M)
 
     def figures(self) -> tuple[PairFigures, ...]:
-        """What is known of each pair."""
+        """Return the outcome of each pair."""
         if not self._tries_others:
             return self._measured()
         self._rematch()

@@ -28,7 +28,7 @@ from mlbatch.units import NS_PER_S
 _MAP_WINDOWS = 20
 # Windows before and after one that its motion is interpolated from.
 _REACH = 2
-# More points a window are thinned; thin trunks need all of 128 beams.
+# More points per window are thinned; thin trunks need all of 128 beams.
 _MOST_POINTS = 130_000
 # Cells, m, and least cosine between normals, of the direction that stands for upward.
 _UP_EDGE_M = 1.0

@@ -1,6 +1,6 @@
 """Poses of all lidars at once, by least squares over distances between surfaces and stems.
 
-A place is two or more windows that follow each other. Its clouds, one a lidar and window, are
+A place is two or more windows that follow each other. Its clouds, one per lidar and window, are
 moved to one instant by a twist of their own, which is solved with the poses: distances between
 windows of one lidar fix the twist, distances between lidars the poses. A correction of a lidar is
 a small motion of its points in the body frame, after the pose that they were converted with.
@@ -105,7 +105,7 @@ Place = Sequence[Cloud]
 
 @dataclass(eq=False, repr=False)
 class State:
-    """What is solved for.
+    """The unknowns.
 
     corrections: of each lidar, body_from_body, the first one ORIGIN; twists: (places, 6), m/s and
     rad/s; delay_s: (lidars,), added to the times of each lidar, the first one 0.
@@ -183,7 +183,7 @@ class Rows(NamedTuple):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Known:
-    """What is known of all lidars but the first without surfaces, as by their motion.
+    """A prior for all lidars but the first without surfaces, as by their motion.
 
     state: corrections and delays; information: of each of these lidars (7, 7), inverse covariance
     of a shift at the body origin, m, a turn, rad, and the delay, s.

@@ -298,7 +298,7 @@ class _Fit:
 
 
 def _words(fit: _Fit, state: _State, covariance: F64Array, name: str) -> tuple[str, str]:
-    """What is not determined: of the rotation, of the delay."""
+    """Reasons why the rotation, and the delay, are not determined; "" if they are."""
     if fit.signal(state) < _LEAST_SIGNAL:
         words = f"{name}: expected a machine that turns, found none that it and the lidar share"
         return f"{words}; {_INSTEAD}", f"{words}; {_INSTEAD}"

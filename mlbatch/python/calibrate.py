@@ -185,7 +185,7 @@ def _imus(
 
 
 def _level(setup: Discovery, first: str) -> str:
-    """What the IMU of the first lidar says of its pose, which is taken as it is."""
+    """Note on the tilt of the first lidar, whose pose is taken as it is, by its IMU; or ""."""
     vertical = vertical_of(setup.frame_id)
     for sensor, up in ups(setup.sampler, setup.router, setup.sensors, standing_gravity):
         tilted_deg = tilt_deg(up, np.array(vertical))

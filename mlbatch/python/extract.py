@@ -46,7 +46,7 @@ def extraction(
     options: ExtractOptions,
     shown: Callable[[str], str] = str,
 ) -> Extraction:
-    """What to extract; shown: the name of an option in errors."""
+    """Return the request of `extract`; shown: the name of an option in errors."""
     start, end, _ = limits_of(
         shown("start"), options.get("start"), shown("end"), options.get("end")
     )

@@ -129,7 +129,7 @@ class PoseFigures(NamedTuple):
     pairs: tuple[PairFigures, ...] = ()
 
     def gaps(self) -> list[str]:
-        """What the check does not cover, a line each."""
+        """Parts that the check does not cover, one line each."""
         if self.reason:
             return [f"not checked ({self.reason})"]
         return [
@@ -142,7 +142,7 @@ class PoseFigures(NamedTuple):
         ]
 
     def describe(self) -> str:
-        """What a verdict says of the poses."""
+        """Words for the outcome in a verdict."""
         if self.reason:
             return f"poses: not checked ({self.reason})"
         known = [pair for pair in self.pairs if pair.is_known]

@@ -217,7 +217,7 @@ def by_files(folder: Path) -> list[str]:
 def _with_most(
     keys: tuple[str, str], least: int, texts: Sequence[str], is_there: Callable[[str], bool]
 ) -> list[str]:
-    """Recipes of which a key of the sensors, and all signs, are there; texts: some must be."""
+    """Recipes whose sensors' key and all signs are there; a recipe must have one of the texts."""
     section, key = keys
     found = []
     for name in recipe_names():

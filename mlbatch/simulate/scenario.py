@@ -437,7 +437,7 @@ def _swing(node: Node) -> Row:
 
 
 def _columns(rows: Sequence[Row]) -> list[F64Array]:
-    """Return one array per value of the rows."""
+    """Return the columns of rows as arrays."""
     return [np.array(column, np.float64) for column in zip(*rows, strict=True)]
 
 

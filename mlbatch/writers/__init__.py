@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from mlbatch.types import RecordLayout, RunInfo
 
 DEFAULT_FORMAT = "npz"
-# Formats of which a scan may be an output of its own.
+# Formats with one file per scan that may be an output alone.
 ONE_FILE = ("npz", "ply", "pcd", "las", "laz")
 # Formats without a header.
 ROWS = ("kitti", "nuscenes")
@@ -67,7 +67,7 @@ def choose_format(target: Path | None, asked: str | None) -> str:
 
 
 def one_file_format(target: Path, asked: str | None) -> str:
-    """Return the format of an output that is the file of one scan, as `scan.ply`; "" of others."""
+    """Return the format of an output that is the file of one scan, as `scan.ply`; else ""."""
     name = target.suffix.lower().removeprefix(".")
     return name if name in ONE_FILE and asked in (None, name) else ""
 

@@ -183,7 +183,7 @@ class MapWriter(ScanWriter):
         return MAP_PCD.pcd_head(lines, count) if is_pcd else MAP_PLY.ply_head(lines, count)
 
     def _lines(self) -> list[str]:
-        """What a header says, as text."""
+        """Lines of text in the header of a map."""
         figures, info = self.figures, self._info
         return [
             f"mlbatch {mlbatch.__version__}: a map",

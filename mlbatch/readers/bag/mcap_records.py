@@ -144,7 +144,7 @@ def _topic(channel: Channel, schema: Schema | None, definition: str) -> Topic:
 
 
 def summary_start(tail: bytes) -> int | None:
-    """Place of the summary, by the last FOOTER_BYTES of a file; 0: none; None: cut off."""
+    """Position of the summary, by the last FOOTER_BYTES of a file; 0: none; None: cut off."""
     if len(tail) != FOOTER_BYTES or not tail.endswith(MAGIC):
         return None
     opcode, length, start, _, _ = _FOOTER.unpack_from(tail)
