@@ -6,66 +6,14 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from mlbatch.arrays import I64Array
 from mlbatch.batching.merge import ColumnMerge
 from mlbatch.lidar.geometry import SECTORS
-from mlbatch.types import NO_COLUMNS, ColumnFigures, Columns, WindowColumns
+from mlbatch.types import NO_COLUMNS, ColumnFigures, WindowColumns
 
 POSITIONS = (1024, None, 512)
 BASE_NS = 1_700_000_000_000_000_000
-
-
-def _part(stamps: list[int], first: int) -> Columns:
-    stamp_ns = np.array(stamps, np.int64)
-    number = np.arange(first, first + len(stamps))
-    return Columns(stamp_ns, number, number * 7 % 512)
-
-
-def _waiting(sensors: list[list[list[int]]]) -> list[list[Columns]]:
-    """Columns of sensors, in parts; their ring indexes are their order of delivery."""
-    waiting = []
-    for parts in sensors:
-        firsts = np.cumsum([0, *(len(part) for part in parts)]).tolist()
-        waiting.append([_part(part, first) for part, first in zip(parts, firsts, strict=False)])
-    return waiting
-
-
-STAMPS = st.lists(st.integers(0, 30), max_size=8)
-PARTS = st.lists(STAMPS, max_size=6)
-
-
-@given(
-    sensors=st.lists(PARTS, min_size=3, max_size=3),
-    in_order=st.booleans(),
-    until=st.integers(0, 31),
-)
-def test_columns_come_by_stamp_sensor_and_delivery(
-    sensors: list[list[list[int]]], in_order: bool, until: int
-) -> None:
-    if in_order:
-        for parts in sensors:
-            ordered = sorted(stamp for part in parts for stamp in part)
-            for part in parts:
-                part[:] = [ordered.pop(0) for _ in part]
-    waiting = _waiting(sensors)
-    merged = ColumnMerge(POSITIONS).take_until(waiting, until)
-    everything = [
-        (stamp, number, place)
-        for number, parts in enumerate(sensors)
-        for place, stamp in enumerate(stamp for part in parts for stamp in part)
-    ]
-    due = sorted(one for one in everything if one[0] < until)
-    found = zip(
-        merged.stamp_ns.tolist(), merged.sensor.tolist(), merged.ring_index.tolist(), strict=True
-    )
-    assert list(found) == due
-    assert merged.encoder.tolist() == [place * 7 % 512 for _, _, place in due]
-    for number, own in enumerate(waiting):
-        left = [place for stamp, sensor, place in everything if sensor == number and stamp >= until]
-        assert sorted(place for one in own for place in one.ring_index.tolist()) == left
 
 
 def _random(seed: int, count: int, most: int) -> WindowColumns:

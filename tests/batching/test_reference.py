@@ -145,11 +145,7 @@ CASES: list[tuple[str, Settings, Seen | str]] = [
     ("0:50 0:210 0:150 1:220 0:350", TWO, {"late": 1}),
     # Published when the last sensor passes end plus slack; at the end without slack.
     ("0:50 1:50 0:150 0:230 1:209.999999~231 1:210~232", TWO, {"windows": [0], "ready": [232]}),
-    (
-        "0:50 0:150 0:200",
-        TEN_HZ,
-        {"spans": [(0, 100, 200)], "ready": [200], "complete": [0]},
-    ),
+    ("0:50 0:150 0:200", TEN_HZ, {"spans": [(0, 100, 200)], "ready": [200], "complete": [0]}),
     # -- intake --
     (
         "0:50 0:9000 0:150 0:250",
@@ -184,11 +180,7 @@ CASES: list[tuple[str, Settings, Seen | str]] = [
     # Duplicates reach 1024 packets back, each renews the reach, and each sensor has its own.
     (f"0:50#9 {duplicate(1023)}", TEN_HZ, {"rejected": [{"duplicate": 1}]}),
     (f"0:50#9 {duplicate(1024)}", TEN_HZ, {"rejected": [{}]}),
-    (
-        f"0:50#9 1:50#9 0:50#9 {duplicate(1023)}",
-        TWO,
-        {"rejected": [{"duplicate": 2}, {}]},
-    ),
+    (f"0:50#9 1:50#9 0:50#9 {duplicate(1023)}", TWO, {"rejected": [{"duplicate": 2}, {}]}),
     # Invalid columns have no stamp: the first would move t0, the last close the window and be wild.
     (
         "0:!0,150,!90000~150 0:250 0:350",
@@ -224,11 +216,7 @@ CASES: list[tuple[str, Settings, Seen | str]] = [
     ),
     # A gap of 1550 is held, then confirmed; windows it overlaps are incomplete: [100, 200) is
     # before the stall from 250, [1800, 1900) begins where it ends. 100 to 250, 1800 to 2850.
-    (
-        GAP,
-        TWO,
-        {"complete": [0, *range(17, 28)], "rejected": [{}, {}], "written1": 4 + 22},
-    ),
+    (GAP, TWO, {"complete": [0, *range(17, 28)], "rejected": [{}, {}], "written1": 4 + 22}),
     (GAP, replace(TWO, max_wait_ns=None), {"complete": [*range(28)], "windows": [*range(28)]}),
     # Sensor 1 is given up at 1100 = 50 + 1000 + 50; [1800, 1900) begins after its first stamp.
     ("0:50..3000 1:1730..3000", TWO, {"t": 100, "complete": [*range(17, 28)]}),
@@ -268,11 +256,7 @@ CASES: list[tuple[str, Settings, Seen | str]] = [
         {"t": 100, "windows": [1, 2], "dropped": [{"outside_time": 11}]},
     ),
     ("0:50..200 0:900..1200", TEN_HZ, {"empty": 7}),
-    (
-        "0:50..200 0:900..1200",
-        replace(TEN_HZ, start_ns=450 * MS, end_ns=750 * MS),
-        {"empty": 3},
-    ),
+    ("0:50..200 0:900..1200", replace(TEN_HZ, start_ns=450 * MS, end_ns=750 * MS), {"empty": 3}),
 ]
 
 

@@ -84,11 +84,7 @@ def readings(
     if scan.reflectivity is not None:
         reflectivity = scan.reflectivity[:count, slots].reshape(shape).copy()
     return Readings(
-        headers,
-        wired(scan.range_m, 0),
-        wired(scan.intensity, 0),
-        reflectivity,
-        wired(scan.xyz),
+        headers, wired(scan.range_m, 0), wired(scan.intensity, 0), reflectivity, wired(scan.xyz)
     )
 
 

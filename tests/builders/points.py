@@ -11,6 +11,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
 import numpy.typing as npt
 
 from mlbatch.arrays import U8Array
@@ -139,56 +140,14 @@ def write_points(
 
 
 HEAD_BYTES = 24
+HEAD = [("magic", "S4"), ("version", "u1"), ("kind", "u1"), ("slots", "<u2"), ("stamp_ns", "<i8")]
+HEAD += [("number", "<u4"), ("count", "<u2"), ("rest", "<u2")]
 
 
-@dataclass(frozen=True, slots=True)
-class Column:
-    """A packet of our own making, read field by field."""
-
-    magic: bytes
-    version: int
-    kind: int
-    slots: int
-    stamp_ns: int
-    number: int
-    count: int
-    x: tuple[float, ...]
-    y: tuple[float, ...]
-    z: tuple[float, ...]
-    level: tuple[float, ...]
-    ring: tuple[int, ...]
-    return_type: bytes
-    tag: bytes
-
-
-def read_packets(packets: U8Array) -> list[Column]:
-    """Contents of packets (P, size), by the layout that `_cloud_packets` states."""
-    found = []
-    for packet in packets:
-        data = packet.tobytes()
-        magic, version, kind, slots, stamp_ns, number, count, *_ = struct.unpack_from(
-            "<4sBBHqIHBB", data
-        )
-        reals = struct.unpack_from(f"<{4 * slots}f", data, HEAD_BYTES)
-        planes = [reals[axis * slots : (axis + 1) * slots] for axis in range(4)]
-        ring = struct.unpack_from(f"<{slots}H", data, HEAD_BYTES + 16 * slots)
-        rest = data[HEAD_BYTES + 18 * slots :]
-        found.append(
-            Column(
-                magic,
-                version,
-                kind,
-                slots,
-                stamp_ns,
-                number,
-                count,
-                planes[0],
-                planes[1],
-                planes[2],
-                planes[3],
-                ring,
-                rest[:slots],
-                rest[slots : 2 * slots],
-            )
-        )
-    return found
+def read_packets(packets: U8Array) -> Any:
+    """Packets (P, size) of our own making as records, by the layout that docs/formats states."""
+    slots = (packets.shape[1] - HEAD_BYTES) // 20
+    planes = [(name, "<f4", slots) for name in ("x", "y", "z", "level")]
+    planes += [("ring", "<u2", slots), ("return_type", "u1", slots), ("tag", "u1", slots)]
+    data = np.ascontiguousarray(packets[:, : HEAD_BYTES + 20 * slots])
+    return data.view(np.dtype([*HEAD, *planes])).reshape(-1).view(np.recarray)

@@ -30,10 +30,7 @@ class Seen:
 
 
 def open_capture(
-    path: Path,
-    *,
-    buffer_bytes: int | None = None,
-    streams: StreamTable | None = None,
+    path: Path, *, buffer_bytes: int | None = None, streams: StreamTable | None = None
 ) -> CaptureRecording:
     """An opened capture with the buffer of a test."""
     recording = open_recording(path, streams or StreamTable())

@@ -77,12 +77,7 @@ def _write(writer: Writer, found: list[Any], change: Change) -> None:
     for schema, channel, message in found:
         number = counts[channel.topic] = counts.get(channel.topic, -1) + 1
         one = Sent(
-            channel.topic,
-            number,
-            message.log_time,
-            message.publish_time,
-            message.data,
-            schema.name,
+            channel.topic, number, message.log_time, message.publish_time, message.data, schema.name
         )
         for new in change(one):
             key = (new.topic, new.kind)

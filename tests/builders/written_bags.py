@@ -14,13 +14,7 @@ from mcap.reader import make_reader
 from mlbatch.types import Message, Scan, Topic
 from mlbatch.writers import open_writer
 from mlbatch.writers.base import WriterOptions
-from tests.builders.scans import (
-    PERIOD_NS,
-    START_NS,
-    SUMMARY,
-    imu_samples,
-    run_job,
-)
+from tests.builders.scans import PERIOD_NS, START_NS, SUMMARY, imu_samples, run_job
 
 QOS_WORDS = """\
 - history: keep_last

@@ -209,10 +209,7 @@ def test_sensors_that_were_never_seen_together() -> None:
 
 def test_wild_pairs_are_found_whatever_the_verdict() -> None:
     comparison = compared(TRUE, Clock(TAI_NS), Clock(500 * NS_PER_MS))
-    assert {(pair.one, pair.two) for pair in comparison.apart(NS_PER_S)} == {
-        ("a", "b"),
-        ("b", "c"),
-    }
+    assert {(pair.one, pair.two) for pair in comparison.apart(NS_PER_S)} == {("a", "b"), ("b", "c")}
 
 
 @pytest.mark.parametrize(

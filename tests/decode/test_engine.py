@@ -188,11 +188,7 @@ class Packing:
     """Records that the loops pack, against the literal ones of the points in arrays."""
 
     def __init__(
-        self,
-        info: RunInfo,
-        sources: list[Source],
-        boxes_m: npt.NDArray[np.float64],
-        name: str,
+        self, info: RunInfo, sources: list[Source], boxes_m: npt.NDArray[np.float64], name: str
     ) -> None:
         record, extras = PACKED[name]
         self._name = name

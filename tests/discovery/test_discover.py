@@ -12,12 +12,7 @@ from mlbatch.discovery.discover import Discovery, SensorSelection, discover
 from mlbatch.errors import RigError
 from mlbatch.readers import open_recording
 from mlbatch.types import StreamTable
-from tests.builders.sessions import (
-    SMALL,
-    Unit,
-    write_metadata,
-    write_session,
-)
+from tests.builders.sessions import SMALL, Unit, write_metadata, write_session
 
 
 def _discover(capture: Path, selection: SensorSelection | None = None) -> Discovery:

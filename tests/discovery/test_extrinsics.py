@@ -148,11 +148,7 @@ FOUND = {
     # base_link is below the sensor, and no ancestor.
     "one sensor is below the other": (
         Given(static=[_at("os_left", "os_right", 0, -2, 0), _at("os_left", "base_link", 0, 0, -2)]),
-        Found(
-            "os_left",
-            {"left": [0, 0, 0], "right": [0, -2, 0]},
-            {"left": "tf_static: os_left"},
-        ),
+        Found("os_left", {"left": [0, 0, 0], "right": [0, -2, 0]}, {"left": "tf_static: os_left"}),
     ),
     "the rig names the body": (
         Given(static=[*SIDES, _at("car", "base_link", 5, 0, 0)], body="car"),
@@ -164,13 +160,7 @@ FOUND = {
             "base_link",
             SIDES_M,
             {"right": "tf: base_link -> os_right"},
-            [
-                (
-                    "constant_tf",
-                    "sensor right: /tf never changed base_link -> os_right in 3 message(s): used "
-                    "as static",
-                )
-            ],
+            [("constant_tf", "sensor right: /tf never changed base_link -> os_right in 3 mes")],
         ),
     ),
     "fixed joints complete transforms": (
@@ -185,9 +175,7 @@ FOUND = {
             notes=[
                 (
                     "extrinsics_contradict",
-                    "sensor left: its extrinsics of tf_static and of urdf differ by 5.0 mm and "
-                    "0.00 degrees (base_link -> left/os_sensor); tf_static is used, correct the "
-                    "wrong one",
+                    "sensor left: its extrinsics of tf_static and of urdf differ by",
                 )
             ],
         ),
@@ -203,9 +191,7 @@ FOUND = {
             notes=[
                 (
                     "extrinsics_contradict",
-                    "sensor left: its extrinsics of tf_static and of urdf differ by 500.0 mm and "
-                    "0.00 degrees (base_link -> roof -> os_left); tf_static is used, correct the "
-                    "wrong one",
+                    "sensor left: its extrinsics of tf_static and of urdf differ by",
                 )
             ],
         ),
@@ -233,9 +219,7 @@ FOUND = {
             [
                 (
                     "extrinsics_contradict",
-                    "sensor left: its extrinsics of rig and of tf_static differ by 7348.5 mm and "
-                    "0.00 degrees (base_link -> left/os_sensor); rig is used, correct the wrong "
-                    "one",
+                    "sensor left: its extrinsics of rig and of tf_static differ by",
                 )
             ],
         ),
@@ -257,13 +241,11 @@ FOUND = {
             [
                 (
                     "extrinsics_frame",
-                    "sensor right: none of the recording's frames (base_link, left/os_sensor) is "
-                    "named as its driver would name it",
+                    "sensor right: none of the recording's frames (base_link, left/",
                 ),
                 (
                     "extrinsics_mixed",
-                    "sensor right: the extrinsics of its metadata are assumed to refer to frame "
-                    "base_link",
+                    "sensor right: the extrinsics of its metadata are assumed to re",
                 ),
             ],
         ),
@@ -305,10 +287,7 @@ FOUND = {
         Found(
             "base_link",
             {"left": [1, 0, 0], "right": [2, 0, 0]},
-            {
-                "left": "tf_static: base_link -> lidar_a",
-                "right": "tf_static: base_link -> lidar_b",
-            },
+            {"left": "tf_static: base_link -> lidar_a", "right": "tf_static: base_link -> lidar_b"},
         ),
     ),
     "the rig names a lidar frame": (
@@ -495,9 +474,7 @@ def test_a_single_sensor_of_unknown_pose_keeps_its_own_frame(body: str | None) -
 
 
 POSES = st.builds(
-    from_rpy_deg,
-    st.tuples(*[st.floats(-10, 10)] * 3),
-    st.tuples(*[st.floats(-180, 180)] * 3),
+    from_rpy_deg, st.tuples(*[st.floats(-10, 10)] * 3), st.tuples(*[st.floats(-180, 180)] * 3)
 )
 
 

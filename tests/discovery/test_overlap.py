@@ -13,15 +13,7 @@ from mlbatch.readers import open_recording
 from mlbatch.types import StreamTable
 from tests.builders.captures import udp_frame, write_pcap
 from tests.builders.reading import packets_in
-from tests.builders.sessions import (
-    NS_PER_MS,
-    NS_PER_S,
-    Records,
-    Shell,
-    Unit,
-    twin,
-    write_metadata,
-)
+from tests.builders.sessions import NS_PER_MS, NS_PER_S, Records, Shell, Unit, twin, write_metadata
 
 DAY_NS = 24 * 3600 * NS_PER_S
 ONE = Unit()

@@ -151,11 +151,7 @@ CASES = {
                 ),
             ),
         )
-        for option in (
-            "--ignore 10.0.0.2:7502",
-            "--ignore 333",
-            "--only ouster_111",
-        )
+        for option in ("--ignore 10.0.0.2:7502", "--ignore 333", "--only ouster_111")
     },
     "an unknown serial number on the stream of a lidar": Case(
         (ONE, twin(ONE, 333, ONE.ip)),

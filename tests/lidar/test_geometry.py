@@ -9,11 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mlbatch.lidar.geometry import (
-    BeamTable,
-    read_rotor_words,
-    spherical,
-)
+from mlbatch.lidar.geometry import BeamTable, read_rotor_words, spherical
 from tests.builders.decoded import Rotor, projected, rotor_words
 
 

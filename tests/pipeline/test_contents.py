@@ -101,10 +101,7 @@ def test_a_bag_without_a_summary_shows_its_length_with_whole(shell: Shell, tmp_p
     ],
 )
 def test_the_index_of_a_bag_states_its_end(
-    tmp_path: Path,
-    name: str,
-    encoding: str,
-    write: Callable[[Path, Sequence[Recorded]], Path],
+    tmp_path: Path, name: str, encoding: str, write: Callable[[Path, Sequence[Recorded]], Path]
 ) -> None:
     messages = fixture_messages(encoding)
     bag = write(tmp_path / name, messages)

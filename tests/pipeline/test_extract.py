@@ -269,10 +269,7 @@ MISTAKES: Mapping[str, tuple[dict[str, object], str]] = {
     "itself": ({"output": "two_lidars.pcap"}, "expected another file than the recordings"),
     "pass": ({"passed": ("/imu",)}, "--pass: expected a bag"),
     "no topic": ({"output": "out.mcap", "passed": ("/imu",)}, "expected a topic of the recording"),
-    "1970": (
-        {"start": Limit(10 * NS_PER_S)},
-        r"write --start \+10 for 10 s after",
-    ),
+    "1970": ({"start": Limit(10 * NS_PER_S)}, r"write --start \+10 for 10 s after"),
     "after": ({"start": Limit(NS_PER_S, from_t_init=True)}, "in the time limits, found none"),
     "overwrite": ({"output": "there.pcap"}, "expected a new output, found an existing one"),
     "name": ({"selection": SensorSelection(only=("rear",))}, "expected the name or serial number"),

@@ -101,8 +101,7 @@ def test_a_stream_without_metadata(shell: Shell, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "head"),
-    [("a.mcap", b"\x89MCAP0\r\n"), ("a.bag", b"#ROSBAG V2.0\n")],
+    ("name", "head"), [("a.mcap", b"\x89MCAP0\r\n"), ("a.bag", b"#ROSBAG V2.0\n")]
 )
 def test_a_recording_of_nothing_but_damage_is_an_error(
     shell: Shell, tmp_path: Path, name: str, head: bytes

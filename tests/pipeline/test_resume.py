@@ -399,13 +399,7 @@ CHANGED = "expected the bytes that the interrupted run has written, found"
 @pytest.mark.parametrize("jobs", ["", "--jobs 3"])
 @pytest.mark.parametrize(
     "words",
-    [
-        "",
-        "--split",
-        "--format ply",
-        "--format nuscenes",
-        "--format rosbag2 --max-bag-duration 0.2",
-    ],
+    ["", "--split", "--format ply", "--format nuscenes", "--format rosbag2 --max-bag-duration 0.2"],
 )
 def test_a_changed_byte_of_a_finished_file_is_found(shell: Shell, words: str, jobs: str) -> None:
     """Of each file of a scan, and of a file of a bag: it is made again, and no other."""

@@ -51,8 +51,3 @@ def test_how_early_a_start_may_be(first_s: int, start_s: int, is_legal: bool) ->
         return
     with pytest.raises(UsageError, match="--start: expected a time of the recording"):
         refuse_outside(limit, None, first_s * NS_PER_S)
-
-
-def test_relative_limits_are_never_outside() -> None:
-    limit = Limit(0, from_t_init=True)
-    refuse_outside(limit, limit, BEGIN_S * NS_PER_S)

@@ -16,14 +16,7 @@ from mcap.writer import IndexType
 
 from tests.builders import rosbag2
 from tests.builders.bags import OUSTER_ROS1, Recorded, packet_message
-from tests.builders.captures import (
-    Interface,
-    Packet,
-    Section,
-    udp_frame,
-    write_pcap,
-    write_pcapng,
-)
+from tests.builders.captures import Interface, Packet, Section, udp_frame, write_pcap, write_pcapng
 from tests.builders.containers import Bag, database, mcap, rosbag1
 from tests.builders.mcaps import LZ4, Form
 from tests.builders.reading import open_bag, open_capture, read

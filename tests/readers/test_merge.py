@@ -15,13 +15,7 @@ from hypothesis import strategies as st
 
 from mlbatch.readers import merge
 from mlbatch.types import Message, PacketBatch, Recording, StreamTable, Topic
-from tests.builders.captures import (
-    Packet,
-    Section,
-    pcap_bytes,
-    section_bytes,
-    udp_frame,
-)
+from tests.builders.captures import Packet, Section, pcap_bytes, section_bytes, udp_frame
 from tests.builders.reading import Seen, assert_balanced, open_capture, seen_of
 
 Session = list[list[int]]

@@ -187,11 +187,7 @@ def _recorded(lidar: Lidar, record: U8Array, which: int) -> Readings:
     assert isinstance(own, Coordinates)
     point = coordinates_of(own, record, which)
     level = record[which * own.return_bytes + own.intensity_at]
-    return (
-        np.array([np.linalg.norm(point)], np.float32),
-        np.array([float(level)]),
-        none,
-    )
+    return (np.array([np.linalg.norm(point)], np.float32), np.array([float(level)]), none)
 
 
 def _planes(own: PlacedPoints, record: U8Array, slots: int) -> Reals:

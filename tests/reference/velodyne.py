@@ -15,10 +15,7 @@ _TIMES = {
     "VLP-16": (55.296, [2.304 * laser for laser in range(16)]),
     "HDL-32E": (46.08, [1.152 * laser for laser in range(32)]),
     "VLP-32C": (55.296, [2.304 * (laser // 2) for laser in range(32)]),
-    "VLS-128": (
-        55.277,
-        [55.277 / 20 * (laser // 8 + (laser // 8 >= 8)) for laser in range(128)],
-    ),
+    "VLS-128": (55.277, [55.277 / 20 * (laser // 8 + (laser // 8 >= 8)) for laser in range(128)]),
     "HDL-64E S2": (48.0, [6.0 * (j // 4) + (0, 1.26, 2.46, 3.66)[j % 4] for j in range(32)] * 2),
     "HDL-64E S3": (57.6, [7.2 * (j // 4) + (0, 1.3, 2.5, 3.7)[j % 4] for j in range(32)] * 2),
 }

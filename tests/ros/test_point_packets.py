@@ -11,10 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mlbatch.ros.point_packets import CloudError, Layout, Points, layout_of, pack
-from tests.builders.points import (
-    STAMP_NS,
-    read_packets,
-)
+from tests.builders.points import STAMP_NS, read_packets
 
 
 def _points(stamps_ns: Sequence[int], rings: Sequence[int] | None = None) -> Points:
@@ -29,17 +26,8 @@ def _points(stamps_ns: Sequence[int], rings: Sequence[int] | None = None) -> Poi
 
 def _columns(packets: npt.NDArray[np.uint8]) -> list[tuple[int, list[int]]]:
     """Stamp and x of all slots of each packet; 0: empty."""
-    return [
-        (column.stamp_ns - STAMP_NS, [int(x) for x in column.x]) for column in read_packets(packets)
-    ]
-
-
-def test_points_that_share_a_stamp_are_a_column() -> None:
-    points = _points([20, 0, 10, 20, 0, 10])
-    layout = layout_of(points, 0)
-    assert layout == Layout(0, 2)
-    columns = _columns(pack(points, layout, 0))
-    assert columns == [(0, [2, 5]), (10, [3, 6]), (20, [1, 4])]
+    columns = read_packets(packets)
+    return [*zip((columns.stamp_ns - STAMP_NS).tolist(), columns.x.tolist(), strict=True)]
 
 
 def test_runs_that_are_too_long_go_on_in_a_column_of_the_same_stamp() -> None:
@@ -47,12 +35,6 @@ def test_runs_that_are_too_long_go_on_in_a_column_of_the_same_stamp() -> None:
     assert _columns(packets) == [(0, [1, 2]), (0, [3, 4]), (0, [5, 0]), (7, [6, 0])]
     assert [column.count for column in read_packets(packets)] == [2, 2, 1, 1]
     assert [column.number for column in read_packets(packets)] == [0, 1, 2, 3]
-
-
-def test_points_of_their_own_times_are_columns_of_one() -> None:
-    points = _points([3, 1, 2], rings=[0, 1, 2])
-    assert layout_of(points, 0) == Layout(0, 1)
-    assert _columns(pack(points, Layout(0, 1), 0)) == [(1, [2]), (2, [3]), (3, [1])]
 
 
 def test_points_lie_at_their_ring_where_columns_are_full_enough() -> None:
@@ -63,23 +45,6 @@ def test_points_lie_at_their_ring_where_columns_are_full_enough() -> None:
     first, second = _columns(pack(points, layout, 0))
     assert first == (0, [*range(1, 13), 0, 0, 0, 0])
     assert second == (10, [*range(13, 25), 0, 0, 0, 0])
-
-
-def test_the_last_ring_of_a_cloud_may_have_fewer_points_than_others() -> None:
-    points = _points([0] * 4, rings=[1, 0, 0, 0])
-    columns = _columns(pack(points, Layout(0, 2, by_ring=True), 0))
-    assert columns == [(0, [2, 1]), (0, [3, 0]), (0, [4, 0])]
-
-
-def test_a_second_point_on_a_ring_starts_a_column_of_its_own() -> None:
-    points = _points([0, 0, 0, 5], rings=[1, 0, 1, 3])
-    packets = pack(points, Layout(0, 16, by_ring=True), 0)
-    empty = [0] * 12
-    assert _columns(packets) == [
-        (0, [2, 1, 0, 0, *empty]),
-        (0, [0, 3, 0, 0, *empty]),
-        (5, [0, 0, 0, 4, *empty]),
-    ]
 
 
 @pytest.mark.parametrize(

@@ -480,10 +480,7 @@ def test_angles_of_a_robosense_are_asked_for(name: str, difops: list[bytes], fou
 @pytest.mark.parametrize(
     ("options", "text"),
     [
-        (
-            {"colour": "red"},
-            "--decode: expected one of crc, firing_azimuth, optical_cen",
-        ),
+        ({"colour": "red"}, "--decode: expected one of crc, firing_azimuth, optical_cen"),
         ({"vertical_offset": "up"}, "--decode vertical_offset: expected on or off, found 'up'"),
         ({"crc": "never"}, "--decode crc: expected check, found 'never'"),
     ],

@@ -41,10 +41,7 @@ def check_bytes(payload: U8Array, expected: str) -> None:
         # Block 0: lasers 0 and 1 of column 0, laser 0 of column 1; block 1: 39.81 -> 40.
         (VelodyneSpec("VLP-16"), "0 ffee0000010000020001 52 010100 100 ffee2800010200"),
         # Blocks 0 and 1 are two returns of columns 0 and 1, block 2 the next pair.
-        (
-            VelodyneSpec("VLP-16", "dual"),
-            "0 ffee0000010000 100 ffee0000018000 200 ffee2800010200",
-        ),
+        (VelodyneSpec("VLP-16", "dual"), "0 ffee0000010000 100 ffee0000018000 200 ffee2800010200"),
         # 35990 = 8c96; 36029.81 - 36000 -> 30.
         (
             VelodyneSpec("Puck Hi-Res", "last", start_azimuth_deg=359.9),

@@ -99,28 +99,20 @@ def moved(x: float, scale: float = 1.0) -> list[float]:
 # Changes to laser 3 of a YAML.
 VELODYNE_LASER: list[tuple[dict[str, object], str]] = [
     ({"laser_id": 16}, "lasers[3].laser_id: expected a laser id from 0 to 15, found 16"),
-    ({"laser_id": -1}, "lasers[3].laser_id: expected a laser id from 0 to 15"),
-    ({"laser_id": "x"}, "lasers[3].laser_id: expected a laser id"),
     ({"laser_id": 2}, "lasers[3].laser_id: expected each id once, found 2 again"),
     ({"vert_correction": ".nan"}, "lasers[3].vert_correction: expected a finite"),
     ({"rot_correction": ".inf"}, "lasers[3].rot_correction: expected a finite"),
-    ({"rot_correction": "nan"}, "found nan"),
-    ({"vert_correction": ""}, "lasers[3].vert_correction: expected a finite number"),
-    ({"vert_correction": "[1]"}, "found ['1']"),
     # Degrees instead of radians.
     ({"vert_correction": -15}, "expected at most 1.5708 rad in absolute value, found -15"),
-    ({"rot_correction": 1.6}, "lasers[3].rot_correction: expected at most 1.5708"),
     # Centimetres instead of metres.
     ({"dist_correction": 130}, "lasers[3].dist_correction: expected at most 2 m"),
     ({"vert_offset_correction": 19.5}, "expected at most 1 m in absolute value, found 19.5"),
-    ({"horiz_offset_correction": -2.6}, "expected at most 1 m in absolute value"),
     # Lasers that measure from places far apart; the second by corrections for near points.
     (
         {"dist_correction": 1.3},
         "dist_correction: expected lasers that measure from places within 1 m of each other, "
         "found 1.3 m",
     ),
-    ({"dist_correction_x": -0.6, "dist_correction_y": 0.6}, "found 1.2 m"),
     (
         {"vert_offset_correction": 0.8, "horiz_offset_correction": 0.8},
         "found 1.13 m, with the offsets of a laser",
@@ -130,11 +122,9 @@ VELODYNE_LASER: list[tuple[dict[str, object], str]] = [
 VELODYNE_END = [
     ("num_lasers: 32\n", "num_lasers: expected 16, the lasers listed, found 32"),
     ("distance_resolution: 2\n", "distance_resolution: expected 0.0005 to 0.02 m"),
-    ("distance_resolution: fine\n", "distance_resolution: expected a finite"),
     ("a: &a [1]\nb: *a\n", "expected values written out, found the alias *a"),
     ("a: " + "[" * 50_000, "expected at most 8 levels, found more"),
     ("a: \x07", "expected YAML, found"),
-    ("---\nb: 1\n", "expected YAML, found"),
     ("#" * MAX_BYTES, f"expected at most {MAX_BYTES} bytes, found 100"),
 ]
 ODD = [
@@ -148,23 +138,16 @@ VELODYNE_YAML: list[tuple[str | bytes, str]] = [
     (velodyne_yaml(sixteen()[:15]), "lasers: expected 16, 32, 64, 128 lasers, found 15"),
     (velodyne_yaml([], "num_lasers: 16\nlaser_id: 1\n"), f"{NO_LASERS}, found none"),
     ("num_lasers: 64\ndistance_resolution: 0.002\n", NO_LASERS),
-    ("lasers: many\nnum_lasers: 1\nlaser_id: 3", NO_LASERS),
-    ("[\nlasers: 16, laser_id: 3]\n", f"{NO_LASERS}, found none"),
     ("lasers:\n" + "- laser_id\n" * 16, "lasers[0]: expected a mapping with laser_id"),
     (velodyne_yaml(sixteen())[:-30], ": expected YAML, found did not find"),
     (velodyne_yaml(sixteen()).encode() + b"# \xff", "expected UTF-8 text, found the byte 0xff"),
-    (
-        velodyne_yaml(ODD),
-        "expected vertical angles of ",
-    ),
+    (velodyne_yaml(ODD), "expected vertical angles of "),
 ]
 # Changes to point 3 of a db.xml.
 VELODYNE_POINT: list[tuple[dict[str, object], str]] = [
     ({"id_": 64}, "DB.points_.item[3].id_: expected a laser id from 0 to 63, found 64"),
     ({"id_": 2}, "DB.points_.item[3].id_: expected each id once, found 2 again"),
-    ({"vertCorrection_": 91}, "vertCorrection_: expected at most 90 degrees"),
     ({"rotCorrection_": "nan"}, "rotCorrection_: expected a finite number, found nan"),
-    ({"distCorrection_": 1500}, "distCorrection_: expected at most 200 cm"),
 ]
 DOCTYPE = "<!DOCTYPE boost_serialization"
 ENTITIES = '[<!ENTITY a "1111111111"><!ENTITY b "&a;&a;&a;">]'
@@ -172,14 +155,8 @@ NO_ENTITIES = "expected XML without entities and definitions, found some"
 VELODYNE_XML: list[tuple[str | bytes, str]] = [
     *((xml_of(entries(64, **changes)), text) for changes, text in VELODYNE_POINT),
     (xml_of(entries(63)), "lasers: expected ids 0 to 63, found no laser 63"),
-    (
-        xml_of([]).replace("0.2<", "0.2<!-- rotCorrection_ --><"),
-        "DB.points_: expected 1 to 128",
-    ),
-    (xml_of(entries(129)), "DB.points_: expected 1 to 128 lasers, found 129"),
+    (xml_of([]).replace("0.2<", "0.2<!-- rotCorrection_ --><"), "DB.points_: expected 1 to 128"),
     (xml_of(entries(64), [0] * 64), "DB.enabled_: expected enabled lasers, found none"),
-    (xml_of(entries(64), [2] * 64), "DB.enabled_: expected at most 128 items of 0 or 1"),
-    (xml_of(entries(64), [1] * 200), "DB.enabled_: expected at most 128 items of 0 or 1"),
     (xml_of(entries(64), lsb_cm=20), "DB.distLSB_: expected 0.05 to 2 cm, found 20"),
     (xml_of(entries(64))[:-200], "expected XML, found"),
     (xml_of(entries(64), kind=f"{DOCTYPE} {ENTITIES}>"), NO_ENTITIES),
@@ -191,15 +168,9 @@ HESAI_LINE: list[tuple[int, list[str], str]] = [
     (2, ["1,0,0"], "line 3: expected every channel once, found channel 1 again"),
     (9, [], "line 16: expected channels 1 to 16, found no channel 9"),
     (4, ["4,nan,0"], "line 5: expected elevation from -90 to 90 deg, found nan"),
-    (4, ["4,90.5,0"], "line 5: expected elevation from -90 to 90 deg, found 90.5"),
     (4, ["4,0,-361"], "line 5: expected azimuth from -360 to 360 deg, found -361"),
-    (4, ["4,0,inf"], "line 5: expected azimuth from -360 to 360 deg, found inf"),
-    (4, ["4,abc,0"], "line 5: expected elevation from -90 to 90 deg, found abc"),
-    (1, ["0,0,0"], "line 2: expected a channel from 1 to 128, found 0"),
     (1, ["129,0,0"], "line 2: expected a channel from 1 to 128, found 129"),
-    (1, ["one,0,0"], "line 2: expected a channel from 1 to 128, found one"),
     (16, ["16,8.0"], "line 17: expected channel, elevation, azimuth, found 16, 8.0"),
-    (16, ["16,,3"], "line 17: expected elevation from -90 to 90 deg, found nothing"),
     (1, ["1" + "x" * 99], "line 2: expected channel, elevation, azimuth, found 1" + "x" * 56),
 ]
 CHANNELS = "16, 20, 32, 40, 64, 90 or 128 channels in all"
@@ -209,7 +180,6 @@ HESAI: list[tuple[str | bytes, str]] = [
         for at, lines, text in HESAI_LINE
     ),
     (text_of(hesai_lines()[:12]), f"HESAI angles, line 12: expected {CHANNELS}, found 11;"),
-    (text_of(hesai_lines()[:1]), f"HESAI angles, line 1: expected {CHANNELS}, found 0;"),
     (
         text_of([*hesai_lines(), f"{DIGEST},,"]).replace(b"3,1.5,-3", b"3,1.6,-3"),
         "HESAI angles, line 18: expected lines that match this SHA-256, found changed lines;",
@@ -218,9 +188,7 @@ HESAI: list[tuple[str | bytes, str]] = [
         (at128(changes={at: value}), f"HESAI AT128 angles: expected {text};")
         for at, value, text in (
             (3, 3, "version 1.5, found 1.3"),
-            (4, 64, "channels 128, found 64"),
             (5, 4, "mirrors 3, found 4"),
-            (6, 1, "frames 3, found 1"),
             (15, 0, "a resolution from 1 to 8, found 0"),
             (9000, 1, "content that matches its SHA-256, found changed content"),
         )
@@ -246,19 +214,13 @@ IMU_TO_SENSOR = ("imu_intrinsics", "imu_to_sensor_transform")
 FORMAT = "lidar_data_format"
 PER_PACKET, PER_FRAME = (FORMAT, "columns_per_packet"), (FORMAT, "columns_per_frame")
 EXTRINSIC = ("ouster-sdk", "extrinsic")
-RIGID = "expected 16 finite numbers, a rigid transform"
 FAR = " at most 1000 mm, found"
 # A key of Ouster metadata, its value, and a pattern of what follows its name.
 OUSTER_KEY: list[tuple[tuple[str, ...], object, str]] = [
     (BEAMS, None, "expected angles in degrees, found nothing"),
-    (BEAMS, [], "expected angles in degrees, found nothing"),
-    (BEAMS, "many", "expected angles in degrees, found many"),
-    (BEAMS, [1.0] * 63 + ["2"], "expected angles in degrees, found 2"),
     (BEAMS, [1.0] * 63 + [True], "expected angles in degrees, found true"),
     (BEAMS, [1.0] * 63 + [float("nan")], "expected angles .*, found nan"),
-    (BEAMS, [1.0] * 63 + [float("-inf")], "expected angles .*, found -inf"),
     (BEAMS, [1.0] * 63 + [10**400], ".*found a number too large for a float"),
-    (BEAMS, [1.0] * 63 + [1e5], "expected angles from -90 to 90 degrees, found 100000"),
     (BEAMS, [90.5] + [1.0] * 63, "expected angles from -90 to 90 degrees, found 90.5"),
     (
         BEAMS,
@@ -273,41 +235,26 @@ OUSTER_KEY: list[tuple[tuple[str, ...], object, str]] = [
     ),
     (BEAMS, [[1.0] * 64] * 4, ".*a unit that does not spin"),
     (AZIMUTHS, [1.0] * 63, "expected 64 angles in degrees, found 63 entries"),
-    (AZIMUTHS, None, "expected 64 angles in degrees, found nothing"),
     ((FORMAT, "pixels_per_column"), 128, "expected 64, .*, found 128"),
     (PER_PACKET, 0, "expected a whole number .*, found 0"),
     (PER_PACKET, 1024, "expected packets up to 65507 bytes"),
-    (PER_FRAME, "1024", "expected a whole number .*found 1024"),
     (PER_FRAME, 10.5, "expected a whole number .*, found 10.5"),
-    (PER_FRAME, True, "expected a whole number .*, found true"),
-    (PER_FRAME, float("nan"), ".*found NaN"),
     ((FORMAT, "column_window"), [0, 1024], r"expected .*0 to 1023, found \[0, 1024\]"),
     ((FORMAT, "column_window"), [0], "expected .*, found 1 entries"),
-    ((FORMAT, "column_window"), [0.5, 9], "expected"),
     ((FORMAT, "udp_profile_lidar"), "RNG99", "expected one of LEGACY, .*RNG99"),
-    ((FORMAT, "udp_profile_lidar"), 7, "expected a text, found 7"),
     ((FORMAT, "header_type"), "ODD", "expected STANDARD or FUSA, found ODD"),
     (("sensor_info", "prod_sn"), "12x4", "expected a serial number in digits"),
-    (("sensor_info", "prod_sn"), "9" * 13, "expected a serial number in digits"),
-    (("sensor_info", "initialization_id"), -1, "expected .*, found -1"),
     (("config_params", "udp_port_lidar"), 70000, "expected .*65535, found 70000"),
-    (LIDAR_TO_SENSOR, [0.0] * 16, RIGID),
-    (LIDAR_TO_SENSOR, np.diag([1.0, 1.0, -1.0, 1.0]).ravel().tolist(), RIGID),
     (LIDAR_TO_SENSOR, [1.0] * 15, "expected 16 .*, found 15 entries"),
-    (BEAM_TO_LIDAR, {"x": 1}, f"{RIGID} .*, found"),
     # Metres.
     (
         LIDAR_TO_SENSOR,
         moved(0.03618),
         "expected millimetres, found 0.03618 mm, 36.18 mm if the file has metres",
     ),
-    (BEAM_TO_LIDAR, moved(0.015806), "expected millimetres, found 0.01581 mm, 15.81 mm if"),
     # Numbers as in files with damaged bytes: 6e15 m, and others that no lidar can have.
     (BEAM_TO_LIDAR, moved(6e18), f".*{FAR} 6e"),
-    (BEAM_TO_LIDAR, moved(1001.0), f".*{FAR} 1001 mm"),
     (BEAM_TO_LIDAR, moved(0.0, scale=1.1), "expected .* rigid"),
-    (BEAM_TO_LIDAR, moved(math.inf), "expected .*, found inf"),
-    (LIDAR_TO_SENSOR, moved(6e18), f".*{FAR} 6e"),
     (LIDAR_TO_SENSOR, moved(math.nan), "expected .*, found nan"),
     (
         LIDAR_TO_SENSOR,
@@ -315,9 +262,7 @@ OUSTER_KEY: list[tuple[tuple[str, ...], object, str]] = [
         "expected beams that leave within 0.5 m of the origin of the sensor, found 0.5",
     ),
     (IMU_TO_SENSOR, moved(-1500.0), f".*{FAR} 1500 mm"),
-    (IMU_TO_SENSOR, moved(0.0, scale=-1.0), "expected .* rigid"),
     (EXTRINSIC, moved(101.0), ".* at most 100 m, found 101 m"),
-    (EXTRINSIC, [2.0] * 16, "expected 16 finite numbers, a rigid"),
 ]
 BROKEN = [
     *(("unit.yaml", content, text) for content, text in VELODYNE_YAML),

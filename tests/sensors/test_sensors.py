@@ -21,12 +21,7 @@ from mlbatch.lidar.interface import Evidence
 from mlbatch.sensors.ouster.profiles import PROFILES, PacketLayout
 from mlbatch.simulate.ouster.encode import OusterSpec, encode_frame, imu_packet, metadata_json
 from mlbatch.types import Stream
-from tests.builders.others import (
-    filled,
-    livox2_packets,
-    rows,
-    velodyne_packets,
-)
+from tests.builders.others import filled, livox2_packets, rows, velodyne_packets
 from tests.builders.vendors import named, vendors, wrongly_excluded
 from tests.fuzz.decoding import sampled
 from tests.fuzz.framing import parts_of
@@ -70,11 +65,7 @@ def test_a_file_too_large_for_a_calibration_is_none(tmp_path: Path) -> None:
 
 def test_a_damaged_packet_does_not_hide_a_stream() -> None:
     xt16 = filled(568, {0: bytes.fromhex("eeff06010000100801040201"), 550: b"\x37"})
-    streams = [
-        velodyne_packets(b"\x37\x22", "VLP-16"),
-        rows([xt16] * 2),
-        livox2_packets(1, 14, 96),
-    ]
+    streams = [velodyne_packets(b"\x37\x22", "VLP-16"), rows([xt16] * 2), livox2_packets(1, 14, 96)]
     for packets in streams:
         whole = np.concatenate([packets, packets[-1:]])
         expected = named(whole)

@@ -9,26 +9,13 @@ from hypothesis import strategies as st
 
 from mlbatch.sensors import content_keys
 from mlbatch.sensors.crc import crc32, crc64
-from mlbatch.sensors.packet_bytes import block_time_us, number
+from mlbatch.sensors.packet_bytes import block_time_us
 from tests.builders.spinning import velodyne_calibration
 
 HOUR_US = 3_600_000_000
 # Ten packets of twelve blocks; a block takes 50 us, in which the rotor rotates by 0.36 degrees.
 STAMP_US = np.arange(10) * 600
 AZIMUTH = (np.arange(10)[:, None] * 12 + np.arange(12)) * 36
-
-
-def test_the_time_of_a_block_by_the_speed_between_packets() -> None:
-    assert block_time_us(STAMP_US, AZIMUTH, HOUR_US) == pytest.approx(50)
-    # Pairs count once, lost packets do not matter, and stamps and angles may wrap.
-    pairs = AZIMUTH.repeat(2, axis=1)
-    assert block_time_us(STAMP_US, pairs, HOUR_US) == pytest.approx(50)
-    assert block_time_us(STAMP_US[[0, 1, 5, 6]], AZIMUTH[[0, 1, 5, 6]], HOUR_US) == pytest.approx(
-        50
-    )
-    late_us = (STAMP_US + HOUR_US - 1000) % HOUR_US
-    turned = (AZIMUTH + 35_000) % 36_000
-    assert block_time_us(late_us, turned, HOUR_US) == pytest.approx(50)
 
 
 def test_without_a_block_time() -> None:
@@ -62,12 +49,6 @@ def test_hashes_are_equal_for_equal_packets_alone(size: int, stride: int) -> Non
     keys = content_keys(packets)
     assert keys[0] == keys[1] != keys[2]
     assert (keys >= 0).all()
-
-
-def test_a_number_at_the_end_of_a_packet() -> None:
-    packets = np.array([[9, 9, 9, 1, 2, 3]], np.uint8)
-    assert number(packets, 3, 3).tolist() == [0x030201]
-    assert number(packets, 1, 3).tolist() == [0x010909]
 
 
 def bitwise(message: bytes) -> int:

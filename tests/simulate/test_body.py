@@ -68,10 +68,7 @@ def test_an_excluded_box_removes_the_machine_and_counts_it(tmp_path: Path) -> No
     # 50 mm around both parts.
     around = (-0.75, -0.35, -0.75, 0.85, 0.55, 0.65)
     mlbatch.convert(
-        recorded.path,
-        rig=recorded.rig,
-        output=tmp_path / "scans",
-        exclude_boxes=[around],
+        recorded.path, rig=recorded.rig, output=tmp_path / "scans", exclude_boxes=[around]
     )
     report = json.loads((tmp_path / "scans" / "report.json").read_text())
     assert report["sensors"][0]["points"]["box"] > 300

@@ -8,11 +8,7 @@ import numpy as np
 import pytest
 
 from mlbatch.simulate.interface import lidar_models
-from tests.builders.simulated import (
-    record,
-    residuals,
-    scenario_text,
-)
+from tests.builders.simulated import record, residuals, scenario_text
 
 LIMIT_M = 5e-3
 LIDAR = """\
@@ -48,8 +44,7 @@ def test_points_of_every_profile_lie_on_the_scene(profile: str, tmp_path: Path) 
 
 
 @pytest.mark.parametrize(
-    ("model", "mode"),
-    [(name, mode) for name, model in MODELS.items() for mode in model.modes[1:]],
+    ("model", "mode"), [(name, mode) for name, model in MODELS.items() for mode in model.modes[1:]]
 )
 def test_points_of_every_mode_lie_on_the_scene(model: str, mode: str, tmp_path: Path) -> None:
     lines = LIDAR.format(model=model, noise=0) + f"    mode: {mode}\n"

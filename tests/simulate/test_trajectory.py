@@ -106,8 +106,7 @@ def test_an_imu_at_rest_feels_gravity() -> None:
 
 
 @pytest.mark.parametrize(
-    ("arm", "radius"),
-    [((0.0, 0.0, 0.0), 2.0), ((0.0, 0.5, 0.0), 1.5), ((0.0, -1.0, 0.3), 3.0)],
+    ("arm", "radius"), [((0.0, 0.0, 0.0), 2.0), ((0.0, 0.5, 0.0), 1.5), ((0.0, -1.0, 0.3), 3.0)]
 )
 def test_an_imu_on_a_circle_feels_what_its_own_place_does(
     arm: tuple[float, float, float], radius: float

@@ -374,10 +374,7 @@ def test_big_endian_messages_are_refused_in_one_line() -> None:
 @pytest.mark.parametrize(
     ("topic", "message"),
     [
-        (
-            Topic("/t", "ouster_ros/PacketMsg", "protobuf"),
-            "messages encoded as cdr or ros1",
-        ),
+        (Topic("/t", "ouster_ros/PacketMsg", "protobuf"), "messages encoded as cdr or ros1"),
         (
             Topic("/t", "velodyne_msgs/VelodyneScan", "cdr", "uint8 other\n", "ros2msg"),
             "expected packets in the field packets.data of velodyne_msgs/VelodyneScan, found a "

@@ -12,13 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mlbatch.readers.capture import dissector
-from tests.builders.captures import (
-    ipv4_packet,
-    ipv6_piece,
-    link_frame,
-    udp_frame,
-    write_pcap,
-)
+from tests.builders.captures import ipv4_packet, ipv6_piece, link_frame, udp_frame, write_pcap
 from tests.builders.reading import Seen, open_capture, read
 from tests.reference.capture import dissect, pcap_frames
 

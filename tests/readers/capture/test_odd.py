@@ -13,13 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mlbatch.readers.capture.odd import MAX_DEPTH, MAX_HEADER_BYTES, find_ip
-from tests.builders.captures import (
-    ipv4_packet,
-    ipv4_packets,
-    ipv6_packet,
-    link_frame,
-    udp_frame,
-)
+from tests.builders.captures import ipv4_packet, ipv4_packets, ipv6_packet, link_frame, udp_frame
 from tests.readers.capture.test_frames import found, whole
 from tests.reference.capture import Frame
 

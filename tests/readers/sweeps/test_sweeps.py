@@ -146,21 +146,8 @@ def _saved(array: Any = None, **arrays: Any) -> bytes:
 # float64 holds ms after the start and the numbers of rings exactly.
 TABLE = np.array(POINTS)
 XYZ = {"points": TABLE[:, :3], "level": TABLE[:, 3].astype("u1"), "ring": TABLE[:, 5].astype("i8")}
-STRUCTURED = np.zeros(
-    len(POINTS), [("x", ">f4"), ("y", "f2"), ("z", "f8"), ("intensity", "u1"), ("t", "i8"),
-                  ("ring", "i2")]
-)  # fmt: skip
-for _name, _column in zip(STRUCTURED.dtype.names or (), TABLE.T, strict=True):
-    STRUCTURED[_name] = _column
 WIDE = {"x": "f4", "y": "f4", "z": "f4", "intensity": "f4", "us": "u8"}
 ARRAYS = "arrays: {x: points.0, y: points.1, z: points.2, intensity: level, ring: ring, t: us}"
-
-
-def _isos() -> dict[str, bytes]:
-    """Sweeps of 0.1 s from 2023-11-14 22:13:20 on."""
-    return {
-        f"a_2_2023-11-14T22:13:20.{number}Z_b.bin": raw(FIELDS, POINTS) for number in range(SWEEPS)
-    }
 
 
 PADDED = {"x": "f4", "pad": "u1", "y": "f4", "z": "f4", "intensity": "f4", "t": "u4"}
@@ -169,22 +156,12 @@ PADDED_POINTS = [(x, 255, y, z, i, t) for x, y, z, i, t, _ in POINTS]
 FORMS: Mapping[str, tuple[Mapping[str, bytes], str]] = {
     "pcd, binary": (_pcds("binary"), "{glob: top/*.pcd, from: start}"),
     "pcd, ascii": (_pcds("ascii"), "{glob: top/*.pcd, from: start}"),
-    "64 bits, binary": (_pcds_of_us("binary"), "{glob: top/*.pcd, unit: us, from: absolute}"),
     "64 bits, ascii": (_pcds_of_us("ascii"), "{glob: top/*.pcd, unit: us, from: absolute}"),
     # The unit of a name is that of its digits.
     "names in us": (_named("{0}.bin", 1000), GLOB),
     "names in ms": (_named("{0}.bin", MS), GLOB),
     "names in s and ns": (_named("{1}.{2:09d}.bin"), GLOB),
     "names of two numbers": (_named("{1}_{2:09d}.bin"), GLOB),
-    "named parts": (
-        _named("n015-{1}__top__{0}.pcd.bin", 1000),
-        GLOB.replace("top/*.bin", "'{sensor}/*__{sensor}__{stamp:us}.pcd.bin'"),
-    ),
-    "dates": (_isos(), GLOB.replace("top/*.bin", "'top/*_{stamp:iso}_b.bin'")),
-    "structured npy": (
-        {f"{start}.npy": _saved(STRUCTURED) for start in _starts()},
-        "{glob: top/*.npy, from: start, unit: ns}",
-    ),
     "npy of one type": (
         {f"{start}.npy": _saved(TABLE) for start in _starts()},
         "{glob: top/*.npy, from: start, unit: ns, dtype: "

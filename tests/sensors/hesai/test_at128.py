@@ -55,23 +55,17 @@ def point(rotor_deg: float, channel: int, range_m: float = 10.0) -> list[float]:
 # (rotor, channel, azimuth, elevation) in deg, worked by hand: azimuth = 2 (rotor - start) + adjust.
 BY_HAND = [
     (75.0, 0, 90.0, 0.0),
-    (120.0, 0, 180.0, 0.0),
     (60.0, 0, 60.0, 0.0),
-    (195.0, 0, 90.0, 0.0),
     (330.0, 100, 120.0, 10.0),
-    (0.0, 0, 180.0, 0.0),
     (29.0, 0, 238.0, 0.0),
     (30.001, 0, 0.002, 0.0),
     # At a step, half and a quarter of the way to the next one, and the way there and back.
     (60.0, 10, 61.0, 1.0),
-    (61.0, 10, 64.0, 1.0),
     (61.5, 10, 65.5, 1.0),
     (59.0, 10, 58.5, 1.0),
-    (63.0, 10, 67.5, 1.0),
     # Elevation, over the end of the revolution.
     (358.0, 10, 176.0, 3.0),
     (359.5, 10, 179.0, 1.5),
-    (357.0, 10, 174.0, 2.0),
 ]
 
 

@@ -166,10 +166,7 @@ def _packet(case: Case) -> bytes:
 
 _ELEVATION_DEG = 10.0
 # Of beams that the packets leave dark, where the field of view of a model ends.
-_LIMITS_DEG = {
-    "QT128C2X": (52.6, -52.6),
-    "XT32M2X": (19.5, -20.8),
-}
+_LIMITS_DEG = {"QT128C2X": (52.6, -52.6), "XT32M2X": (19.5, -20.8)}
 _DOWN_TO_DEG = {"PandarXT-16": -15.0, "PandarXT-32": -16.0}
 
 
