@@ -1,7 +1,7 @@
-"""Firing times and optical centres of HESAI lidars, read from docs/sources/hesai.md.
+"""Layouts, firing times and optical centres of HESAI lidars, read from docs/sources/hesai.md.
 
-The page quotes files of the vendor's SDK and manuals (sections 5, 6 and 12). Times are in ns after
-the time of a block.
+The page quotes files of the vendor's SDK and manuals (sections 2, 3, 5, 6 and 12). Times are in
+ns after the time of a block.
 """
 
 from __future__ import annotations
@@ -57,6 +57,52 @@ _FORMULAS = {
     "XT32M2X": [368 + 2888 * ((channel - 1) % 16) for channel in range(1, 33)],
     "JT16": [0] * 16,
 }
+
+# Names in the tables of sections 2 (layout), 3 (tails) and 5 (times of blocks).
+LAYOUTS = {
+    "Pandar40P": ("40p", "40P, 64", "40P"),
+    "Pandar64": ("64", "40P, 64", "64"),
+    "PandarQT64": ("qt64", "QT64", "QT64"),
+    "QT128C2X": ("qt128", "QT128", "QT128"),
+    "PandarXT-16": ("xt16", "XT family", "XT-16"),
+    "PandarXT-32": ("xt32", "XT family", "XT-32"),
+    "XT32M2X": ("xt32m", "XT family", "XT32M2X"),
+    "Pandar128E3X": ("128e3x, ot128", "128E3X, OT128, JT128", "128E3X, single"),
+    "OT128": ("128e3x, ot128", "128E3X, OT128, JT128", "OT128"),
+    "JT128": ("128e3x, ot128", "128E3X, OT128, JT128", "JT128"),
+    "AT128": ("at128", "AT128", "AT128"),
+}
+
+
+def layout(model: str) -> list[int]:
+    """Bytes of the header, blocks, channels, byte of the azimuth in a block and of the first
+    channel, bytes of a channel without options."""
+    cells = _cells("## 2. ", LAYOUTS[model][0])
+    return [int(re.findall(r"\d+", cells[column])[0]) for column in (1, 2, 3, 5, 6, 7)]
+
+
+def tail(model: str, field: str) -> int | None:
+    """Where a tail has a field, or its length; None: it has none."""
+    heads = _cells("## 3. ", "field")
+    cell = _cells("## 3. ", field)[heads.index(LAYOUTS[model][1])]
+    return None if cell == "-" else int(cell.split()[0])
+
+
+def cadence_ns(model: str) -> tuple[int, float]:
+    """Time of the first firing group of a packet, or of the last if they are counted back from it
+    (negative step), and from group to group."""
+    text = _cells("## 5. ", LAYOUTS[model][2])[1]
+    base, sign, step, divisor = re.findall(
+        r"(?:(-?\d+) )?([+-]) ?\(?(\d+) x [^/]*(?://[^/]*)?(?:/ (\d))?", text
+    )[0]
+    return int(base or 0), int(f"{sign}{step}") / int(divisor or 1)
+
+
+def _cells(heading: str, first: str) -> list[str]:
+    """Cells of the row of a section that begins with a text."""
+    text = PAGE.read_text(encoding="utf-8").partition(f"\n{heading}")[2].partition("\n## ")[0]
+    rows = [line.strip("| ").split(" | ") for line in text.splitlines() if line.startswith("|")]
+    return next(row for row in rows if row[0] == first)
 
 
 def firing_ns(model: str) -> I64Array:

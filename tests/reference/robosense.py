@@ -1,4 +1,4 @@
-"""Firing times, lenses, units and return modes of ROBOSENSE by docs/sources/robosense.md."""
+"""Layouts, times, lenses, units and return modes of ROBOSENSE by docs/sources/robosense.md."""
 
 from __future__ import annotations
 
@@ -62,6 +62,42 @@ def firing_us(model: str) -> Sequence[Sequence[float]]:
     return [grouped] + [_listed("Ruby Plus 80v", 4)] * (model == "Ruby Plus 80")
 
 
+def blocks(model: str) -> tuple[int, bytes, int, int, int]:
+    """Bytes of the header, first bytes of a block, blocks, readings in each and its bytes,
+    section 3."""
+    _, header, first, count, readings, stride, *_ = _row("## 3. ", model)
+    return (
+        int(header),
+        bytes.fromhex(first.partition(",")[0]),
+        int(count),
+        int(readings.split()[0]),
+        int(stride),
+    )
+
+
+def fields(model: str) -> tuple[int, int]:
+    """Bytes of the time and of the return mode in the header of a packet, section 2; 0: none."""
+    names = {"RS-": "RSMsopHeaderV1", "Airy": "RSAIRYHeader", "Ruby": "RSMsopHeaderV2"}
+    struct = next((one for start, one in names.items() if model.startswith(start)), None)
+    row = _row("| struct | time", f"`{struct or 'RSHELIOSMsopHeader'}`")
+    return int(row[1].partition("-")[0]), int(re.sub("^-", "0", row[2]).split()[0])
+
+
+def magic(model: str) -> bytes:
+    """First bytes of a packet, section 1."""
+    kind = "first kind (RS" if model.startswith("RS-") else "second kind (Helios"
+    kind = "80-byte header" if model.startswith("Ruby") else kind
+    line = next(line for line in _page().splitlines() if "| MSOP, " in line and kind in line)
+    return bytes.fromhex(line.split("`")[1])
+
+
+def angles(model: str) -> tuple[int, int, float]:
+    """Bytes of elevations and azimuths in a device packet (0: none) and degrees, section 6."""
+    _, elevation, azimuth, _, unit = _row("| model | elevation at", model)
+    at = [int(re.findall(r"\d+", cell)[0]) for cell in (elevation, azimuth)]
+    return at[0], at[1], float(re.findall(r"[\d.]+", unit)[0])
+
+
 def unit_m(model: str) -> float:
     """Metres of a count, section 3."""
     return float(_row("## 3. ", model)[7].partition(",")[0])
@@ -90,7 +126,9 @@ def round_us(model: str) -> float:
 
 def _row(heading: str, model: str) -> list[str]:
     """Cells of the first row below a heading that names a model, or one of its family."""
-    text = _page().partition(f"\n{heading}")[2].partition("\n## ")[0]
+    # Of a section, or of a table alone.
+    end = "\n\n" if heading.startswith("|") else "\n## "
+    text = _page().partition(f"\n{heading}")[2].partition(end)[0]
     rows = [line.strip("| ").split(" | ") for line in text.splitlines() if line.startswith("|")]
     family, _, lines = _short(model).rpartition(" ")
     for wanted in (

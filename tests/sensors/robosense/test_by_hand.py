@@ -1,8 +1,7 @@
 """ROBOSENSE: heads and device packets as the manuals print them, modes of the document.
 
-Source: docs/sources/robosense.md. Where readings lie and when they fire: the encoders, which follow
-the document by tables of their own, in `tests/sensors/test_round_trip.py`; their firing times by
-hand: `test_encoders.py`.
+Source: docs/sources/robosense.md. Where readings lie and when they fire: `test_documents.py`; that
+decoders and encoders follow these rows: `test_round_trip.py`.
 """
 
 from __future__ import annotations
