@@ -1,4 +1,4 @@
 """Windows against frame-level fusion of sweeps, on the same recording.
 
-statistics.py measures sets of sweeps (batching/sweeps.py), compare.py runs both.
+compare.py measures sets of sweeps (batching/sweeps.py) and windows; instant.py finds where they differ.
 """

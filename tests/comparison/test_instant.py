@@ -14,7 +14,7 @@ import pytest
 import mlbatch
 from mlbatch.arrays import F32Array, F64Array, U8Array
 from mlbatch.comparison.compare import WINDOWS, Comparison, compare
-from mlbatch.comparison.places import apart, cells, difference
+from mlbatch.comparison.instant import apart, cells, difference
 from mlbatch.discovery.discover import SensorSelection
 from mlbatch.page.instant import InstantSet, SharedInstant
 from mlbatch.page.points import CloudPoints

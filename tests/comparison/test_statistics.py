@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from mlbatch.batching.sweeps import Sweep
-from mlbatch.comparison.statistics import SetStatistics
+from mlbatch.comparison.compare import SetStatistics
 from mlbatch.units import NS_PER_MS
 
 
