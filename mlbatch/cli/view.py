@@ -46,8 +46,7 @@ def view(
     **values: Any,
 ) -> None:
     """Show the scans of an output or a recording in the browser, on this machine alone."""
-    from mlbatch.page.view_scans import ViewScans
-    from mlbatch.page.view_server import ViewServer
+    from mlbatch.page.view_server import ViewScans, ViewServer
     from mlbatch.pipeline.interrupts import interruptible
 
     begin, total, job = _source(sources, values)

@@ -1,4 +1,5 @@
 """Windows against frame-level fusion of sweeps, on the same recording.
 
-compare.py measures sets of sweeps (batching/sweeps.py) and windows; instant.py finds where they differ.
+compare.py measures sets of sweeps (batching/sweeps.py) and windows, instant.py finds where they
+differ most.
 """

@@ -16,8 +16,8 @@ from mlbatch.arrays import BoolArray, F32Array, F64Array, I64Array
 from mlbatch.batching.fusion import MOST_AGE_NS
 from mlbatch.batching.sweeps import Sweep, SweepSet, sweeps_of
 from mlbatch.batching.windows import Window
+from mlbatch.page.clouds import CloudPoints
 from mlbatch.page.instant import RADIUS_M, InstantSet, SharedInstant, Spot
-from mlbatch.page.points import CloudPoints
 from mlbatch.pipeline.decode_pool import first_ring_index
 from mlbatch.pipeline.sensor import Sensor
 from mlbatch.types import Scan, WindowColumns

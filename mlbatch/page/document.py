@@ -18,13 +18,21 @@ import numpy.typing as npt
 from mlbatch.arrays import F64Array, I64Array
 from mlbatch.clocks.timescale import DESCRIPTION, describe_time
 from mlbatch.errors import RecordingError
-from mlbatch.page.clouds import chosen_clouds
-from mlbatch.page.findings import Finding, Level, findings, number, percent, verdict
-from mlbatch.page.points import PageCloud
+from mlbatch.page.clouds import PageCloud, chosen_clouds
+from mlbatch.page.findings import (
+    COSTS,
+    MEANINGS,
+    SERVICES,
+    Finding,
+    Level,
+    findings,
+    number,
+    percent,
+    verdict,
+)
 from mlbatch.page.source import Source
 from mlbatch.page.templates import Verdict, asset, page_json, render
 from mlbatch.page.windows import Windows, read_windows, summarise
-from mlbatch.page.words import COSTS, MEANINGS, SERVICES
 from mlbatch.reports.report import RunReport, SensorReport, Unassigned
 from mlbatch.types import CLOUDS
 from mlbatch.units import NS_PER_MS

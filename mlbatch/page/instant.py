@@ -10,9 +10,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from mlbatch.arrays import F64Array, I64Array
-from mlbatch.page.clouds import MOST_CHARS
+from mlbatch.page.clouds import MOST_CHARS, CloudPoints, PageCloud, Place, joined_cloud
 from mlbatch.page.document import cloud_data
-from mlbatch.page.points import CloudPoints, PageCloud, Place, joined_cloud
 from mlbatch.page.policies import offset_m
 from mlbatch.units import NS_PER_MS
 

@@ -17,9 +17,8 @@ from mlbatch.arrays import F64Array, I64Array
 from mlbatch.batching.grid import Grid
 from mlbatch.batching.windows import Window
 from mlbatch.motion.estimate import Estimate, VelocityEstimator
-from mlbatch.motion.moves import PoseLine
 from mlbatch.motion.registration import ORIGIN, ColumnCloud
-from mlbatch.motion.track import PoseTrack
+from mlbatch.motion.track import PoseLine, PoseTrack
 from mlbatch.pipeline.decode_pool import first_ring_index
 from mlbatch.reports.motion import MotionLedger, VelocityCounts
 from mlbatch.types import ImuSamples, Message, Scan, WindowColumns, instant_ns

@@ -22,8 +22,7 @@ from mlbatch.errors import ClockError, RigError
 from mlbatch.lidar.limits import FAR_POSE_M
 from mlbatch.motion.gravity import STANDSTILL_NS
 from mlbatch.motion.imu import Integrator
-from mlbatch.motion.moves import PoseLine
-from mlbatch.motion.track import PoseTrack
+from mlbatch.motion.track import PoseLine, PoseTrack
 from mlbatch.motion.tum import read_tum
 from mlbatch.pipeline.constant_velocity import WindowPoints
 from mlbatch.pipeline.decode_pool import first_ring_index

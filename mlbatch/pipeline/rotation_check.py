@@ -14,7 +14,7 @@ from mlbatch.arrays import F64Array
 from mlbatch.errors import RecordingError
 from mlbatch.motion.agreement import FEW_WINDOWS, LITTLE_ROTATION, Agreement, Turns, agreement
 from mlbatch.motion.estimate import VelocityEstimator
-from mlbatch.motion.moves import PoseLine
+from mlbatch.motion.track import PoseLine
 from mlbatch.reports.motion import RotationFigures
 from mlbatch.units import NS_PER_S
 

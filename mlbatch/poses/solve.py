@@ -515,7 +515,7 @@ def after_move(pose: Pose, move: Pose) -> Pose:
 
 def _follow_votes(problem: Problem, state: State) -> bool:
     """Move each lidar whose stems meet those of the others elsewhere; whether there was one."""
-    from mlbatch.poses.votes import best_move
+    from mlbatch.poses.stems import best_move
 
     followed = False
     for lidar in range(1, problem.lidars):

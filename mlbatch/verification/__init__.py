@@ -13,8 +13,7 @@ from pathlib import Path
 from mlbatch.outputs.damage import CHECKS, CheckLog, VerifyError, Violation
 from mlbatch.outputs.run_files import RunFiles
 from mlbatch.verification.examination import Progress
-from mlbatch.verification.outputs import Output, check_output
-from mlbatch.verification.verdict import Check, Verdict
+from mlbatch.verification.outputs import Check, Output, Verdict, check_output
 
 __all__ = ["CHECKS", "Check", "Verdict", "VerifyError", "Violation", "verify"]
 

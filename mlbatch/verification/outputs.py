@@ -1,4 +1,4 @@
-"""The kinds of outputs: how each is read, and what it cannot show.
+"""The kinds of outputs: how each is read, what it cannot show, and the result of all checks.
 
 Libraries of a format are loaded only for outputs of that format.
 """
@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from mlbatch.outputs import npz
-from mlbatch.outputs.damage import CheckLog, DamageError, VerifyError
+from mlbatch.outputs.damage import CHECKS, CheckLog, DamageError, VerifyError, Violation
 from mlbatch.outputs.kinds import RANGES, FileFormat, kind_of
 from mlbatch.outputs.metadata import RunMetadata, metadata_of_grid
 from mlbatch.outputs.run_files import PIECES, TABLE, RunFiles
@@ -19,10 +19,68 @@ from mlbatch.verification import messages
 from mlbatch.verification.examination import Examination, Progress
 from mlbatch.verification.messages import TopicChecks, layout_limits
 from mlbatch.verification.report_checks import ReportFiles
-from mlbatch.verification.verdict import Verdict, outcomes
 
 if TYPE_CHECKING:
     from mlbatch.outputs.rosbag2 import Yaml
+
+
+@dataclass(frozen=True, slots=True)
+class Check:
+    """Outcome of a check."""
+
+    name: str
+    # Number of values that were checked.
+    checked: int
+    # Number of violations, including those that are not kept.
+    violations: int
+    # Reason why nothing, or only a part, is checkable in this output.
+    limit: str
+
+    @property
+    def outcome(self) -> str:
+        """One of ok, violated, not checkable."""
+        if self.violations:
+            return "violated"
+        return "ok" if self.checked else "not checkable"
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """The result for one output."""
+
+    path: str
+    # As in `convert --format`.
+    format: str
+    scans: int
+    points: int
+    # None where the format does not show columns.
+    columns: int | None
+    checks: tuple[Check, ...]
+    violations: tuple[Violation, ...]
+
+    @property
+    def count(self) -> int:
+        """All violations, also those that are not kept."""
+        return sum(check.violations for check in self.checks)
+
+    @property
+    def ok(self) -> bool:
+        """Whether there is no violation."""
+        return self.count == 0
+
+
+def outcomes(log: CheckLog, limits: dict[str, str]) -> tuple[Check, ...]:
+    """All checks; limits: by check, why it is not or only partly checkable."""
+    return tuple(
+        Check(
+            name,
+            log.checked[name],
+            log.failed[name],
+            limits.get(name, "" if log.checked[name] else "no such data in this output"),
+        )
+        for name in CHECKS
+    )
+
 
 _NO_REPORT = "no report in or next to the output; give it with --report"
 _FOREIGN = "expected an output of mlbatch (a folder of scans, an MCAP file, a bag)"

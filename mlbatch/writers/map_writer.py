@@ -2,12 +2,15 @@
 
 Coordinates are whole millimetres from an offset: LAS stores both, PLY their sum as float64, and PCD
 float32, since PCL reads no other. With voxels only the first point in each is kept, in the order of
-the scans. Sources: those of `las_encoder.py`, `formats/ply.py` and `formats/pcd.py`.
+the scans. Sources: those of `formats/las.py`, `formats/ply.py` and `formats/pcd.py`.
 """
 
 from __future__ import annotations
 
 import contextlib
+import importlib
+import mmap
+import tempfile
 from collections.abc import Callable, Iterator
 from datetime import datetime, timezone
 from pathlib import Path
@@ -18,17 +21,15 @@ import numpy as np
 import mlbatch
 from mlbatch.arrays import I64Array
 from mlbatch.clocks.timescale import TAI, UTC
-from mlbatch.errors import ExportError, UsageError, one_line
+from mlbatch.errors import ExportError, RigError, UsageError, install_extra, one_line
 from mlbatch.motion.se3 import rotated
 from mlbatch.reports.map_figures import MapFigures
 from mlbatch.types import RunInfo, Scan, Summary
 from mlbatch.units import NS_PER_S
 from mlbatch.writers.atomic import export_errors, prepare
 from mlbatch.writers.base import ScanJob, ScanWriter
-from mlbatch.writers.las_encoder import EXTRA_BYTES, RECORD, VLR_NUMBER, VLR_USER, load_lazrs
-from mlbatch.writers.map_crs import MapCrs
+from mlbatch.writers.formats.las import EXTRA_BYTES, RECORD, VLR_NUMBER, VLR_USER, load_lazrs
 from mlbatch.writers.point_layouts import MAP_PCD, MAP_PLY, ScanRecords, record_bytes
-from mlbatch.writers.voxel_filter import MOST_VOXELS, VoxelFilter
 
 UNITS_PER_M = 1000
 # The offset is the first pose, rounded to so many m: 0 in local frames.
@@ -218,3 +219,121 @@ class _AddJob(ScanJob):
     def commit(self) -> None:
         with self._writer.errors():
             self._writer.add(self._scan)
+
+
+# Poses so near to the origin, m, are usually those of a local frame.
+_LOCAL_M = 10_000.0
+# Systems are used beyond their area, but less far, degrees.
+_BEYOND_DEG = (20.0, 10.0)
+
+
+class MapCrs:
+    """A projected system in metres, looked up by pyproj; x is easting, y northing, z up."""
+
+    def __init__(self, name: str) -> None:
+        """name: EPSG:NNNN; UsageError for another or an unknown one, and without pyproj."""
+        try:
+            pyproj = importlib.import_module("pyproj")
+        except ImportError as err:
+            raise UsageError(
+                f"--crs: expected the package pyproj, found none ({err}); {install_extra('crs')}"
+            ) from err
+        _, _, code = name.upper().partition("EPSG:")
+        try:
+            crs: Any = pyproj.CRS.from_epsg(code)
+            # OGC 01-009 (WKT 1), which ends with a zero in LAS.
+            self.wkt = crs.to_wkt("WKT1_GDAL").encode() + b"\0"
+        except pyproj.exceptions.CRSError as err:
+            text = f"--crs: expected a known EPSG:NNNN, found {name!r}; write --crs EPSG:32633"
+            raise UsageError(text) from err
+        self.name = f"EPSG:{code}"
+        plane = crs.sub_crs_list[0] if crs.is_compound else crs
+        if not plane.is_projected or {axis.unit_name for axis in crs.axis_info} != {"metre"}:
+            found = f"{plane.type_name} in {crs.axis_info[0].unit_name} ({crs.name})"
+            text = f"--crs: expected a projected system in metres, found {found}"
+            raise UsageError(f"{text}; give that of the poses")
+        self._area = crs.area_of_use
+        self._to_degrees = pyproj.Transformer.from_crs(plane, plane.geodetic_crs, always_xy=True)
+
+    def check(self, x: float, y: float) -> None:
+        """RigError for a position in m that is far from where the system is used."""
+        east, north = self._to_degrees.transform(x, y)
+        wider, higher = (0.0, 0.0) if max(abs(x), abs(y)) < _LOCAL_M else _BEYOND_DEG
+        area = self._area
+        # Areas may enclose 180 degrees.
+        width = (area.east - area.west) % 360.0 or 360.0
+        is_known = area.south - higher <= north <= area.north + higher
+        if not (is_known and (east - area.west + wider) % 360.0 <= width + 2.0 * wider):
+            raise RigError(
+                f"--crs {self.name}: expected poses with eastings and northings of {area.name}, "
+                f"found x {x:.1f}, y {y:.1f} m; give their system, or none for a local frame"
+            )
+
+
+# Bits of a coordinate in a block, and of that of a block, around the origin of the map.
+_SHIFT, _AXIS_BITS = 5, 21
+_BLOCK_BYTES = 1 << (3 * _SHIFT - 3)
+MOST_VOXELS = 1 << (_AXIS_BITS - 1 + _SHIFT)
+# The file grows by so many blocks. After so many scans all pages are unmapped: those in use return.
+_GROWTH, _SCANS = 4096, 64
+
+
+class VoxelFilter:
+    """Remembers which voxels have a point, in constant memory.
+
+    Voxels are bits in blocks of 32 x 32 x 32, 4 KB each, in a temporary file that is mapped into
+    memory: a scan touches the blocks in the range of its lidars, the system keeps the others on
+    the disk. Memory that grows is 16 bytes per block.
+    """
+
+    def __init__(self, edge: int, folder: Path) -> None:
+        """edge: in units of the coordinates; folder: of the temporary file."""
+        self._edge = edge
+        self._file = tempfile.TemporaryFile(dir=folder, buffering=0)  # noqa: SIM115
+        # Numbers of blocks, increasing, and their places in the file.
+        self._keys: I64Array = np.zeros(0, np.int64)
+        self._places: I64Array = np.zeros(0, np.int64)
+        self._map: mmap.mmap | None = None
+        self._scans = 0
+
+    def first(self, units: I64Array) -> I64Array:
+        """Return the indexes, increasing, of the points (n, 3) that are the first in their voxel.
+
+        units: less than MOST_VOXELS voxels from the origin. OSError where the disk is full.
+        """
+        cells = units // self._edge
+        x, y, z = ((cells >> _SHIFT) + (1 << (_AXIS_BITS - 1))).T
+        keys, block = np.unique((((x << _AXIS_BITS) | y) << _AXIS_BITS) | z, return_inverse=True)
+        a, b, c = (cells & ((1 << _SHIFT) - 1)).T
+        voxels = (self._places_of(keys)[block] << (3 * _SHIFT)) | (a << (2 * _SHIFT))
+        voxels, first = np.unique(voxels | (b << _SHIFT) | c, return_index=True)
+        self._scans += 1
+        if self._map is None or self._scans % _SCANS == 0:
+            self._map = mmap.mmap(self._file.fileno(), 0)
+        bits = np.frombuffer(self._map, np.uint8)
+        mask = np.left_shift(1, voxels & 7).astype(np.uint8)
+        is_new = (bits[voxels >> 3] & mask) == 0
+        # Several voxels share a byte.
+        np.bitwise_or.at(bits, voxels[is_new] >> 3, mask[is_new])
+        return np.sort(first[is_new])
+
+    def close(self) -> None:
+        """Remove the temporary file."""
+        self._map = None
+        self._file.close()
+
+    def _places_of(self, keys: I64Array) -> I64Array:
+        """Places of the blocks with keys (k,), increasing; new ones are empty."""
+        at = self._keys.searchsorted(keys)
+        is_new = np.append(self._keys, -1)[at] != keys
+        if not is_new.any():
+            return self._places[at]
+        count = len(self._keys)
+        end = count + int(is_new.sum())
+        self._keys = np.insert(self._keys, at[is_new], keys[is_new])
+        self._places = np.insert(self._places, at[is_new], np.arange(count, end))
+        while self._file.tell() < end * _BLOCK_BYTES:
+            # Written, since a mapped page without a place on the disk would end the process.
+            self._file.write(bytes(_GROWTH * _BLOCK_BYTES))
+            self._map = None
+        return self._places[self._keys.searchsorted(keys)]

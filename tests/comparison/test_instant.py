@@ -16,8 +16,8 @@ from mlbatch.arrays import F32Array, F64Array, U8Array
 from mlbatch.comparison.compare import WINDOWS, Comparison, compare
 from mlbatch.comparison.instant import apart, cells, difference
 from mlbatch.discovery.discover import SensorSelection
+from mlbatch.page.clouds import CloudPoints
 from mlbatch.page.instant import InstantSet, SharedInstant
-from mlbatch.page.points import CloudPoints
 from mlbatch.pipeline.job import Job
 from tests.builders.simulated import Recorded, record, scenario_text
 

@@ -63,7 +63,7 @@ NEEDLESS = (
     *("mlbatch.readers.bag.recording", "mlbatch.readers.bag.packet_messages"),
     *("mlbatch.readers.bag.folder", "mlbatch.readers.bag.clouds", "mlbatch.faults.replay"),
     *("mlbatch.frames.urdf", "mlbatch.pipeline.inspect", "mlbatch.comparison.compare"),
-    *("mlbatch.verification.verdict", "mlbatch.api"),
+    *("mlbatch.verification.outputs", "mlbatch.api"),
     *("mlbatch.writers.formats.npz", "mlbatch.writers.formats.ply"),
     *("mlbatch.writers.formats.rosbag1", "mlbatch.cli.compare"),
     *("mlbatch.cli.inspect", "mlbatch.cli.verify", "mlbatch.cli.report", "mlbatch.page.document"),

@@ -10,9 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from mlbatch.arrays import F64Array, I64Array
-from mlbatch.motion.moves import PoseLine
 from mlbatch.motion.se3 import exp_rotation
-from mlbatch.motion.track import MAX_GAP_NS, PoseTrack
+from mlbatch.motion.track import MAX_GAP_NS, PoseLine, PoseTrack
 from mlbatch.types import instant_ns
 from tests.reference.motion import column_motion
 

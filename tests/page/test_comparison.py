@@ -14,9 +14,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from mlbatch.page import write_text_page
+from mlbatch.page.clouds import CloudPoints
 from mlbatch.page.comparison import binned, comparison_page, nice_step
 from mlbatch.page.instant import InstantSet, SharedInstant, Spot
-from mlbatch.page.points import CloudPoints
 from mlbatch.page.policies import PolicyFigures, offset_m
 from tests.page.browser import CHROMIUM, NO_CHROMIUM, Browser
 

@@ -15,8 +15,7 @@ import numpy.typing as npt
 import pytest
 
 from mlbatch.outputs.read import open_scans
-from mlbatch.page.clouds import choose_places, chosen_clouds, read_clouds
-from mlbatch.page.points import _view
+from mlbatch.page.clouds import _view, choose_places, chosen_clouds, read_clouds
 from mlbatch.page.windows import read_windows
 from tests.builders.sessions import FIXTURE, Shell
 from tests.page.runs import report, sensor, table, text

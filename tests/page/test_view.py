@@ -24,8 +24,7 @@ import pytest
 import mlbatch
 from mlbatch.errors import RecordingError
 from mlbatch.outputs.read import read
-from mlbatch.page.view_scans import MOST_KEPT, ViewScans
-from mlbatch.page.view_server import LOOPBACK, ViewServer
+from mlbatch.page.view_server import LOOPBACK, MOST_KEPT, ViewScans, ViewServer
 from tests.builders.sessions import FIXTURE
 from tests.contract.tree import run_mlbatch
 from tests.page.browser import CHROMIUM, NO_CHROMIUM, Browser
@@ -105,7 +104,7 @@ def convert(folder: Path, output: str, *options: str) -> Path:
 
 
 def same(shown: Any, scan: mlbatch.Scan) -> None:
-    """A scan of the server against one of the library; fields as in points.py."""
+    """A scan of the server against one of the library; fields as in clouds.py."""
     points = points_of(shown)
     valid = scan.is_valid
     columns = scan.lidar_id if scan.lidar_id.ndim == valid.ndim else scan.lidar_id[:, None]

@@ -7,8 +7,7 @@ import pytest
 
 from mlbatch.arrays import F64Array
 from mlbatch.motion.registration import ORIGIN
-from mlbatch.poses.stems import Stems
-from mlbatch.poses.votes import best_move
+from mlbatch.poses.stems import Stems, best_move
 from tests.poses.clouds import motion
 
 COUNT = 60

@@ -1,4 +1,4 @@
-"""Transforms of columns to one instant, pose by pose: the oracle of `motion/moves.py`."""
+"""Transforms of columns to one instant, pose by pose: the oracle of `motion/track.py`."""
 
 from __future__ import annotations
 

@@ -8,7 +8,7 @@ import pytest
 from mlbatch.errors import MlbatchError
 from mlbatch.outputs.damage import MAX_KEPT, CheckLog
 from mlbatch.verification import CHECKS, VerifyError
-from mlbatch.verification.verdict import outcomes
+from mlbatch.verification.outputs import outcomes
 
 
 def test_a_violation_names_the_first_and_counts_all() -> None:

@@ -12,7 +12,7 @@ import pytest
 
 from mlbatch.errors import ExportError, UsageError
 from mlbatch.types import Scan
-from mlbatch.writers import check_target, direct_writes, open_writer, output_file, plugin
+from mlbatch.writers import check_target, open_writer, output_file, plugin
 from mlbatch.writers.base import WriterOptions
 from mlbatch.writers.formats import format_names
 from tests.builders.scans import (
@@ -200,7 +200,7 @@ def test_large_outputs_have_the_same_bytes(
         scans = [replace(organized_scan(15_000), index=index) for index in range(4)]
     expected = whole(name, tmp_path / "whole", scans)
     monkeypatch.setattr(output_file, "_DROP_BYTES", 100_000)
-    monkeypatch.setattr(direct_writes, "_STAGE_BYTES", 8 * direct_writes.BLOCK_BYTES)
+    monkeypatch.setattr(output_file, "_STAGE_BYTES", 8 * output_file.BLOCK_BYTES)
     assert whole(name, tmp_path / "large", scans) == expected
 
 

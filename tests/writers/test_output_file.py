@@ -12,9 +12,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mlbatch.writers import direct_writes, output_file
-from mlbatch.writers.direct_writes import BLOCK_BYTES, DirectWrites
+from mlbatch.writers import output_file
 from mlbatch.writers.output_file import (
+    BLOCK_BYTES,
+    DirectWrites,
     OutputFile,
     file_crc,
     joined_crc,
@@ -38,7 +39,7 @@ def content(size: int, seed: int) -> bytes:
 @pytest.fixture(scope="module", autouse=True)
 def small_stage() -> object:
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(direct_writes, "_STAGE_BYTES", STAGE_BYTES)
+        patch.setattr(output_file, "_STAGE_BYTES", STAGE_BYTES)
         yield
 
 

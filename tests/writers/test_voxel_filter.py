@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from mlbatch.writers.voxel_filter import VoxelFilter
+from mlbatch.writers.map_writer import VoxelFilter
 
 
 def test_the_first_point_in_each_voxel(tmp_path: Path) -> None:

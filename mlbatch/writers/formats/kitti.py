@@ -12,8 +12,13 @@ from pathlib import Path
 from mlbatch.types import RunInfo
 from mlbatch.writers.base import ScanWriter, WriterOptions, fixed
 from mlbatch.writers.point_layouts import ROWS_KITTI
-from mlbatch.writers.scan_comments import RecordEncoder
-from mlbatch.writers.scan_folder import TIMES_TXT, FolderWriter, check_dense, times_text
+from mlbatch.writers.scan_folder import (
+    TIMES_TXT,
+    FolderWriter,
+    RecordEncoder,
+    check_dense,
+    times_text,
+)
 
 FORMAT = "kitti"
 SUFFIX: str | None = None

@@ -12,8 +12,7 @@ from pathlib import Path
 from mlbatch.types import RunInfo
 from mlbatch.writers.base import DEFAULT_POINT_LAYOUT, ScanWriter, WriterOptions, fixed
 from mlbatch.writers.point_layouts import CLOUD_LAYOUTS
-from mlbatch.writers.scan_comments import RecordEncoder
-from mlbatch.writers.scan_folder import FolderWriter
+from mlbatch.writers.scan_folder import FolderWriter, RecordEncoder
 
 FORMAT = "pcd"
 SUFFIX: str | None = None

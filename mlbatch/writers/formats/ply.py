@@ -11,8 +11,7 @@ from pathlib import Path
 from mlbatch.types import RecordLayout, RunInfo
 from mlbatch.writers.base import ScanWriter, WriterOptions, fixed
 from mlbatch.writers.point_layouts import PLY_LAYOUTS
-from mlbatch.writers.scan_comments import RecordEncoder
-from mlbatch.writers.scan_folder import FolderWriter, check_dense
+from mlbatch.writers.scan_folder import FolderWriter, RecordEncoder, check_dense
 
 FORMAT = "ply"
 SUFFIX: str | None = None
