@@ -11,9 +11,8 @@ from pathlib import Path
 from typing import NamedTuple
 
 from mlbatch.bounded import open_file
+from mlbatch.outputs import commented, las, npz, webdataset
 from mlbatch.outputs import float_rows as rows
-from mlbatch.outputs import las, npz, pcd, ply, webdataset
-from mlbatch.outputs.commented import commented_limits
 from mlbatch.outputs.damage import CheckLog, VerifyError
 from mlbatch.outputs.folders import ScanFile, ScanReader, entries, refuse_shard, scan_files
 
@@ -58,10 +57,10 @@ FILE_FORMATS = (
         npz.LIMITS | {"geometry": RANGES},
         webdataset.samples,
     ),
-    FileFormat("ply", ply.SUFFIX, ply.PlyReader, commented_limits("PLY")),
-    FileFormat("pcd", pcd.SUFFIX, pcd.PcdReader, commented_limits("PCD")),
-    FileFormat("las", las.LAS_SUFFIX, las.LasReader, commented_limits("LAS")),
-    FileFormat("laz", las.LAZ_SUFFIX, las.LasReader, commented_limits("LAS")),
+    FileFormat("ply", commented.PLY_SUFFIX, commented.PlyReader, commented.commented_limits("PLY")),
+    FileFormat("pcd", commented.PCD_SUFFIX, commented.PcdReader, commented.commented_limits("PCD")),
+    FileFormat("las", las.LAS_SUFFIX, las.LasReader, commented.commented_limits("LAS")),
+    FileFormat("laz", las.LAZ_SUFFIX, las.LasReader, commented.commented_limits("LAS")),
     FileFormat("nuscenes", rows.NUSCENES_SUFFIX, rows.RowReader, rows.NUSCENES_LIMITS),
     FileFormat("kitti", rows.KITTI_SUFFIX, rows.RowReader, rows.KITTI_LIMITS),
 )

@@ -15,8 +15,7 @@ import numpy as np
 
 from mlbatch.arrays import BoolArray, F64Array, I64Array
 from mlbatch.errors import install_extra
-from mlbatch.outputs.commented import CommentedReader, Fields
-from mlbatch.outputs.comments import ScanComments
+from mlbatch.outputs.commented import CommentedReader, Fields, ScanComments
 from mlbatch.outputs.containers import check_unpacked_size, library_errors
 from mlbatch.outputs.damage import DamageError, VerifyError
 
