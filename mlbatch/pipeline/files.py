@@ -35,13 +35,13 @@ from mlbatch.types import ImuSamples, Message, Scan
 from mlbatch.writers import has_several_files, plugin
 from mlbatch.writers.atomic import (
     FILES_JSONL,
+    METADATA,
     SCANS_CSV,
     discard,
     export_errors,
     locked,
     partial_path,
 )
-from mlbatch.writers.bag_metadata import METADATA
 from mlbatch.writers.base import WriterOptions, windows_per_file
 from mlbatch.writers.formats import file_suffixes, windows_of_format
 from mlbatch.writers.output_file import file_crc, write_all

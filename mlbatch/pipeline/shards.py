@@ -27,13 +27,13 @@ from mlbatch.reports.report import RunReport
 from mlbatch.writers import has_several_files
 from mlbatch.writers.atomic import (
     FILES_JSONL,
+    METADATA,
     SCANS_CSV,
     SHARD_JSON,
     export_errors,
     partial_path,
     write_text,
 )
-from mlbatch.writers.bag_metadata import METADATA
 from mlbatch.writers.base import WriterOptions
 from mlbatch.writers.formats import built_in_names
 from mlbatch.writers.output_file import file_crc

@@ -27,6 +27,7 @@ from mlbatch.writers.formats import format_of_files
 PARTIAL_SUFFIX = ".partial"
 SCANS_CSV = "scans.csv"
 REPORT_JSON = "report.json"
+METADATA = "metadata.yaml"  # of a ROS 2 bag
 # In a folder with the files of one shard, instead of the report.
 SHARD_JSON = "shard.json"
 # In a folder under construction, and in that of a shard: the files that are whole, see
