@@ -144,7 +144,7 @@ static inline Four chosen(FourWords is_first, Four first, Four second)
     return (Four)((is_first & (FourWords)first) | (~is_first & (FourWords)second));
 }
 
-/* Point data record format 6 and extra bytes, as in `las.py`; the points are side by side.
+/* Point data record format 6 and extra bytes, as in `las_encoder.py`; the points are side by side.
    bytes: of the record, the last two a reflectivity or not there. */
 static void pack_las(const Rows *rows, int64_t count, int64_t bytes, double whole_s,
                      int64_t rest_ns, Totals *totals, uint8_t *restrict record)

@@ -2,7 +2,7 @@
 
 Coordinates are whole millimetres from an offset: LAS stores both, PLY their sum as float64, and PCD
 float32, since PCL reads no other. With voxels only the first point in each is kept, in the order of
-the scans. Sources: those of `formats/las.py`, `formats/ply.py` and `formats/pcd.py`.
+the scans. Sources: those of `las_encoder.py`, `formats/ply.py` and `formats/pcd.py`.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from mlbatch.types import RunInfo, Scan, Summary
 from mlbatch.units import NS_PER_S
 from mlbatch.writers.atomic import export_errors, prepare
 from mlbatch.writers.base import ScanJob, ScanWriter
-from mlbatch.writers.formats.las import EXTRA_BYTES, RECORD, VLR_NUMBER, VLR_USER, load_lazrs
+from mlbatch.writers.las_encoder import EXTRA_BYTES, RECORD, VLR_NUMBER, VLR_USER, load_lazrs
 from mlbatch.writers.point_layouts import MAP_PCD, MAP_PLY, ScanRecords, record_bytes
 
 UNITS_PER_M = 1000

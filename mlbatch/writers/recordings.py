@@ -147,7 +147,7 @@ def new_bag(path: Path, suffix: str) -> Bag:
     """Create a container of messages; suffix: of its final name."""
     if suffix == ROSBAG1:
         # Not loaded for other containers.
-        from mlbatch.writers.formats.rosbag1 import Rosbag1Container
+        from mlbatch.writers.rosbag1_container import Rosbag1Container
 
         return Rosbag1Container(path)
     return McapFile(path) if suffix == MCAP else SqliteFile(path)

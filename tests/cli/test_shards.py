@@ -16,7 +16,8 @@ import pytest
 from rosbags.highlevel import AnyReader
 
 from mlbatch.types import Scan
-from mlbatch.writers.formats import npz, webdataset
+from mlbatch.writers import npz_encoder as npz
+from mlbatch.writers.formats import webdataset
 from mlbatch.writers.output_file import Bytes
 from tests.builders.captures import write_pcap
 from tests.builders.run import Outcome, command

@@ -34,7 +34,7 @@ from mlbatch.sensors.ouster.profiles import PROFILES
 from mlbatch.simulate.ouster.encode import OusterSpec
 from mlbatch.simulate.spinning import SpinningSpec
 from mlbatch.types import EXTRAS, RecordLayout, RunInfo, SensorInfo
-from mlbatch.writers.formats.las import RECORD as LAS
+from mlbatch.writers.las_encoder import RECORD as LAS
 from mlbatch.writers.point_layouts import (
     CLOUD_LAYOUTS,
     PLY_LAYOUTS,

@@ -9,7 +9,7 @@ import pytest
 
 from mlbatch.arrays import F64Array
 from mlbatch.types import Scan
-from mlbatch.writers.formats import npz
+from mlbatch.writers import npz_encoder as npz
 from mlbatch.writers.output_file import Bytes
 from tests.builders.sessions import Shell, arrays, names, report_of
 from tests.builders.simulated import Recorded, record, scenario_text

@@ -27,7 +27,8 @@ from mlbatch.pipeline import output as pipeline_output
 from mlbatch.readers import source
 from mlbatch.types import Scan
 from mlbatch.writers import atomic
-from mlbatch.writers.formats import npz, webdataset
+from mlbatch.writers import npz_encoder as npz
+from mlbatch.writers.formats import webdataset
 from mlbatch.writers.output_file import Bytes
 from tests.builders.run import command
 from tests.builders.sessions import FIXTURE, SMALL, Shell, Unit, write_session

@@ -1,13 +1,13 @@
 """A folder of LAZ files: LAS, compressed by lazrs; needs the extra `las`.
 
-Source: as of `las.py`.
+Source: as of `las_encoder.py`, docs/sources/outputs.md section 6.
 """
 
 from __future__ import annotations
 
 from functools import partial
 
-from mlbatch.writers.formats.las import extras, open_folder, record_layout
+from mlbatch.writers.las_encoder import extras, open_folder, record_layout
 
 __all__ = ["COMPRESSES", "FORMAT", "SUFFIX", "extras", "open_writer", "record_layout"]
 

@@ -21,7 +21,7 @@ from isal.isal_zlib import crc32
 from mlbatch.types import EXTRAS, RunInfo, Scan, Summary
 from mlbatch.writers.atomic import export_errors
 from mlbatch.writers.base import CHECKSUMS, ScanJob, ScanWriter, WriterOptions, fixed
-from mlbatch.writers.formats.npz import NpzEncoder
+from mlbatch.writers.npz_encoder import NpzEncoder
 from mlbatch.writers.output_file import Bytes, OutputFile, take_scratch
 from mlbatch.writers.scan_folder import FolderWriter, name_of_windows, scan_name
 
