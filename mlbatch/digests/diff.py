@@ -3,28 +3,20 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 from dataclasses import dataclass, field
 from fractions import Fraction
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from mlbatch.digests.comparison import Difference, Json, scan_name, walk
 from mlbatch.digests.golden import Values, describe_run, fields_of, values
 from mlbatch.errors import UsageError
-from mlbatch.outputs.read import read
+from mlbatch.outputs.read import IndexedScans, opened
 from mlbatch.outputs.run_files import RunFiles
 from mlbatch.outputs.scan import Scan
 from mlbatch.units import NS_PER_S
-
-
-class _Key(NamedTuple):
-    """Window and sensor, by which scans of two outputs are matched."""
-
-    window: tuple[int, int]  # index in the first output, slice
-    sensor: str
 
 
 @dataclass(slots=True)
@@ -77,22 +69,29 @@ def diff(a: Path, b: Path, tolerance: float = 0.0) -> OutputDiff:
     result = OutputDiff()
     old, new = (describe_run(output, RunFiles.of(output).texts()[0]) for output in (a, b))
     result.run += walk("", old, new, tolerance)
-    for one, other in _pairs(_Side(a), _Side(b, _windows_between(old, new))):
-        name = _name(one, other)
-        if one is None or other is None:
-            (result.only_in_b if one is None else result.only_in_a).append(name)
-        else:
+    one, other = opened(a), opened(b)
+    numbers, others = _by_window(one, 0), _by_window(other, _windows_between(old, new))
+    for key, number in numbers.items():
+        if key in others:
             result.compared += 1
-            _compare(result, name, one, other, tolerance)
+            scan = one.scan(number)
+            _compare(result, _name(scan), scan, other.scan(others[key]), tolerance)
+        else:
+            result.only_in_a.append(_name(one.scan(number)))
+    result.only_in_b += [_name(other.scan(others[key])) for key in others if key not in numbers]
     return result
 
 
-def _name(*scans: Scan | None) -> str:
-    """The name of a scan in the first output that has it."""
-    return next(scan_name(one.index, one.slice, one.sensor) for one in scans if one is not None)
+def _name(scan: Scan) -> str:
+    return scan_name(scan.index, scan.slice, scan.sensor)
 
 
-# -- scans in both ----------------------------------------------------------------------------
+def _by_window(scans: IndexedScans, later: int) -> dict[tuple[int, int, str], int]:
+    """Numbers of scans by window in the first output, slice and sensor; later: windows to it."""
+    return {
+        (place.window + later, place.slice, place.sensor): number
+        for number, place in enumerate(scans.places)
+    }
 
 
 def _windows_between(a: Any, b: Any) -> int:
@@ -107,62 +106,6 @@ def _windows_between(a: Any, b: Any) -> int:
     # Bounds are rounded up to whole nanoseconds.
     is_one_grid = rate == other and abs(count * NS_PER_S / rate - (other_ns - begin_ns)) < 1
     return count if is_one_grid else 0
-
-
-def _pairs(a: _Side, b: _Side) -> Iterator[tuple[Scan | None, Scan | None]]:
-    """Scans of both outputs by window, with None where one output lacks the scan.
-
-    Scans wait for their counterpart while that can come: folders have them sensor by sensor, other
-    outputs window by window.
-    """
-    sides = (a, b)
-    while not all(side.is_done for side in sides):
-        for side, other in (sides, sides[::-1]):
-            scan = side.next()
-            if scan is None:
-                continue
-            key = side.key
-            match = other.waiting.pop(key, None)
-            if match is None:
-                side.waiting[key] = scan
-            else:
-                yield (scan, match) if side is a else (match, scan)
-        yield from _unmatched(sides)
-    yield from _unmatched(sides)
-
-
-class _Side:
-    """One output; waiting: scans without a counterpart so far; later: windows to the first."""
-
-    def __init__(self, output: Path, later: int = 0) -> None:
-        self._scans = read(output)
-        self._later = later
-        self.waiting: dict[_Key, Scan] = {}
-        self.key = _Key((later - 2, 0), "")
-        self.is_done = False
-        self.is_by_sensor = output.is_dir() and any(one.is_dir() for one in output.iterdir())
-
-    def next(self) -> Scan | None:
-        """The next scan; None at the end."""
-        scan = next(self._scans, None)
-        if scan is None:
-            self.is_done = True
-        else:
-            self.key = _Key((scan.index + self._later, scan.slice), scan.sensor)
-        return scan
-
-    def has_passed(self, key: _Key) -> bool:
-        """Whether no scan of this window follows."""
-        if self.is_done:
-            return True
-        return not self.is_by_sensor and self.key.window > key.window
-
-
-def _unmatched(sides: tuple[_Side, _Side]) -> Iterator[tuple[Scan | None, Scan | None]]:
-    for side, other in (sides, sides[::-1]):
-        for key in [key for key in side.waiting if other.has_passed(key)]:
-            scan = side.waiting.pop(key)
-            yield (scan, None) if side is sides[0] else (None, scan)
 
 
 # -- values -----------------------------------------------------------------------------------

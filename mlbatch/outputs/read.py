@@ -106,13 +106,18 @@ def _file_of_folder(path: Path) -> IndexedScans | None:
     return _IndexedFiles(folder, form, files, CheckLog(), None) if files else None
 
 
+def opened(path: Path) -> IndexedScans:
+    """The scans of an output as of `open_scans`, or the one in a file of a folder."""
+    return _file_of_folder(path) or open_scans(path)
+
+
 def read(path: Path, *, by_window: bool = False) -> Iterator[Scan]:
     """Yield the scans of an output in its order, with `--split` sensor by sensor.
 
     path: as of `open_scans`, or one file of a scan; by_window: by time also where sensors have
     folders. Raises RecordingError where the output is damaged, unfinished or of another program.
     """
-    scans = _file_of_folder(path) or open_scans(path)
+    scans = opened(path)
     numbers: Iterable[int] = range(len(scans.places))
     if by_window:
         numbers = sorted(numbers, key=lambda number: scans.places[number][1:3])
