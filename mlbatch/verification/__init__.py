@@ -13,7 +13,7 @@ from pathlib import Path
 from mlbatch.outputs.damage import CHECKS, CheckLog, VerifyError, Violation
 from mlbatch.outputs.run_files import RunFiles
 from mlbatch.verification.examination import Progress
-from mlbatch.verification.outputs import Check, Output, Verdict, check_output
+from mlbatch.verification.outputs import Check, Verdict, check_output
 
 __all__ = ["CHECKS", "Check", "Verdict", "VerifyError", "Violation", "verify"]
 
@@ -46,4 +46,4 @@ def verify(
     log.ok("container")
     if unfinished.exists():
         log.fail("container", unfinished.name, "no unfinished run next to the output", "one")
-    return check_output(Output(path, RunFiles.of(path, report), log, progress))
+    return check_output(path, RunFiles.of(path, report), log, progress)

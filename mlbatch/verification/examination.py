@@ -63,6 +63,7 @@ class Examination:
         self._progress = progress
         self._all = 0 if files.table is None else len(files.table.index)
         self.log = log
+        self.metadata = metadata
         self._files = files
         # Why checks are impossible for scans of these options.
         self.limits = metadata.limits

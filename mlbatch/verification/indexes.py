@@ -10,7 +10,7 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import NamedTuple, TypeAlias
+from typing import TypeAlias
 
 from mcap.records import (
     AttachmentIndex,
@@ -74,6 +74,7 @@ class CheckedMcap(McapFile):
 
     def __init__(self, log: CheckLog, path: Path) -> None:
         super().__init__(log, path, path.name)
+        self.name = path.name
         self._spans_ns: list[tuple[int, int]] = []
         self._is_damaged = False
         self._chunks: list[McapRecord] = []
@@ -223,25 +224,23 @@ class CheckedMcap(McapFile):
 # -- bags -----------------------------------------------------------------------------------------
 
 
-class BagFile(NamedTuple):
-    """Content of one MCAP file: messages, first and last log time."""
-
-    name: str
-    messages: int
-    span_ns: tuple[int, int]
-
-
 def check_metadata(
-    log: CheckLog, about: Yaml, files: Sequence[BagFile], counts: Counter[str]
+    log: CheckLog,
+    about: Yaml,
+    files: Sequence[CheckedMcap],
+    messages: Sequence[int],
+    counts: Counter[str],
 ) -> None:
-    """Check the content of metadata.yaml against files; counts: of their messages by topic."""
-    first_ns = min(file.span_ns[0] for file in files)
-    last_ns = max(file.span_ns[1] for file in files)
+    """Check the content of metadata.yaml against files; messages: in each; counts: by topic."""
+    firsts, lasts = zip(*(file.span_ns for file in files), strict=True)
     expected: dict[str, Yaml] = {
         "version": _VERSION,
         "storage_identifier": "mcap",
-        **_times((first_ns, last_ns), counts.total()),
-        "files": [{"path": file.name, **_times(file.span_ns, file.messages)} for file in files],
+        **_times((min(firsts), max(lasts)), counts.total()),
+        "files": [
+            {"path": file.name, **_times(file.span_ns, count)}
+            for file, count in zip(files, messages, strict=True)
+        ],
     }
     for key, value in expected.items():
         log.equal("metadata", f"{METADATA} {key}", value, value_at(about, key))

@@ -14,6 +14,7 @@ from typing import Protocol
 import numpy as np
 
 from mlbatch.arrays import F64Array
+from mlbatch.motion.se3 import rotations_of
 from mlbatch.outputs.cloud_messages import CLOUD, PRESETS, read_cloud, stored_scan
 from mlbatch.outputs.containers import Message
 from mlbatch.outputs.damage import CheckLog, DamageError
@@ -110,7 +111,6 @@ class TopicChecks:
     """Takes the messages of an output one after the other."""
 
     log: CheckLog
-    metadata: RunMetadata
     examination: Examination
     report: Document | None
     # Of the first cloud.
@@ -127,6 +127,11 @@ class TopicChecks:
     # Frames in other messages, by topic: own ones, and recorded ones.
     _named: dict[str, set[str]] = field(default_factory=dict)
     _recorded: dict[str, set[str]] = field(default_factory=dict)
+
+    @property
+    def metadata(self) -> RunMetadata:
+        """Metadata of the run."""
+        return self.examination.metadata
 
     @property
     def split(self) -> bool:
@@ -345,7 +350,7 @@ class TopicChecks:
     ) -> None:
         """Check a transform against a pose (4, 4) of the report."""
         is_near = np.allclose(translation_m, pose[:3, 3], rtol=0, atol=_LARGEST_ERROR)
-        is_near &= np.allclose(_matrix(rotation), pose[:3, :3], rtol=0, atol=1e-3)
+        is_near &= np.allclose(rotations_of(rotation[None])[0], pose[:3, :3], rtol=0, atol=1e-3)
         self.log.ok("tf_static")
         if not is_near:
             found = [*translation_m.tolist(), *rotation.tolist()]
@@ -382,15 +387,3 @@ class TopicChecks:
 def _clean(frame: str) -> str:
     """A frame without the leading slash that ROS 1 allowed."""
     return frame.lstrip("/")
-
-
-def _matrix(quaternion: F64Array) -> F64Array:
-    """Rotation (3, 3) of a unit quaternion (x, y, z, w)."""
-    x, y, z, w = quaternion.tolist()
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-        ]
-    )

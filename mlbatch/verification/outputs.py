@@ -5,10 +5,8 @@ Libraries of a format are loaded only for outputs of that format.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from mlbatch.outputs import npz
 from mlbatch.outputs.damage import CHECKS, CheckLog, DamageError, VerifyError, Violation
@@ -19,9 +17,6 @@ from mlbatch.verification import messages
 from mlbatch.verification.examination import Examination, Progress
 from mlbatch.verification.messages import TopicChecks, layout_limits
 from mlbatch.verification.report_checks import ReportFiles
-
-if TYPE_CHECKING:
-    from mlbatch.outputs.rosbag2 import Yaml
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,25 +82,46 @@ _FOREIGN = "expected an output of mlbatch (a folder of scans, an MCAP file, a ba
 _NAME_ONE = "name the output of `mlbatch convert`"
 
 
-@dataclass(frozen=True, slots=True)
-class Output:
-    """An output to check."""
+class _Output:
+    """An output to check, with its report and table, and the metadata of its run."""
 
-    path: Path
-    files: RunFiles
-    log: CheckLog
-    progress: Progress | None = None
+    def __init__(
+        self, path: Path, paths: RunFiles, log: CheckLog, progress: Progress | None
+    ) -> None:
+        self.path = path
+        self.paths = paths
+        self.log = log
+        self._progress = progress
+        # Why checks are not or only partly possible.
+        self.limits: dict[str, str] = {}
+        self.files = ReportFiles(None, None)
 
-    def verdict(
-        self, name: str, examination: Examination, limits: dict[str, str], files: ReportFiles
-    ) -> Verdict:
-        """The result after all checks; limits: why checks are not or only partly possible."""
-        totals = examination.totals
-        limits = limits | examination.limits
-        if files.table is None or files.table.checksum is None:
-            reason = f"no {TABLE}" if files.table is None else f"a {TABLE} of an earlier version"
+    def read_side_files(self, *, has_table: bool = True) -> None:
+        """Read the report and the table in or next to the output; has_table: it has to be there."""
+        self.files = ReportFiles.read(self.log, self.paths)
+        if has_table and not self.paths.table.exists():
+            self.log.fail("table", TABLE, "the table of scans", "none")
+
+    def examine(self, own: RunMetadata, without_rate: str = "") -> Examination:
+        """Begin the checks; own: metadata in the output; without_rate: what may have none."""
+        self.metadata = self.files.metadata(self.log, own)
+        if self.metadata.rate is None and without_rate:
+            reason = f"{without_rate} no rate; {_NO_REPORT}"
+            self.limits |= dict.fromkeys(("grid", "index"), reason)
+        self.examination = Examination(
+            self.log, str(self.path), self.metadata, self.files, self._progress
+        )
+        return self.examination
+
+    def verdict(self, name: str) -> Verdict:
+        """The result after all checks; name: of the format."""
+        totals = self.examination.totals
+        table = self.files.table
+        limits = self.limits | self.examination.limits
+        if table is None or table.checksum is None:
+            reason = f"no {TABLE}" if table is None else f"a {TABLE} of an earlier version"
             limits = {"checksum": f"{reason}: it has the checksums"} | limits
-        if files.report is None:
+        if self.files.report is None:
             limits = dict.fromkeys(("ledger", "report", "t_init"), _NO_REPORT) | limits
         if not totals.scans and not self.log.violations:
             raise VerifyError(f"{self.path}: expected scans, found none; convert again")
@@ -120,43 +136,21 @@ class Output:
         )
 
 
-def check_output(output: Output) -> Verdict:
-    """Check an output of any kind."""
-    kind = kind_of(output.path)
+def check_output(path: Path, paths: RunFiles, log: CheckLog, progress: Progress | None) -> Verdict:
+    """Check an output of any kind; paths: of its report and table."""
+    kind = kind_of(path)
+    output = _Output(path, paths, log, progress)
     if kind.form is not None:
         return _check_files(kind.form, output)
-    if kind.name == "mcap":
-        return _check_mcap(output, [output.path], kind.name)
-    if kind.name == "rosbag1":
-        return _check_bag(output)
-    if kind.name == "rosbag2":
-        return _check_rosbag2(output)
-    raise VerifyError(f"{output.path}: {_FOREIGN}, found {kind.found}; {_NAME_ONE}")
+    if kind.name:
+        return _check_messages(kind.name, output)
+    raise VerifyError(f"{path}: {_FOREIGN}, found {kind.found}; {_NAME_ONE}")
 
 
-def _side_files(output: Output) -> ReportFiles:
-    """The report and the table, which has to be there."""
-    files = ReportFiles.read(output.log, output.files)
-    if not output.files.table.exists():
-        output.log.fail("table", TABLE, "the table of scans", "none")
-    return files
-
-
-def _examination(output: Output, files: ReportFiles, metadata: RunMetadata) -> Examination:
-    return Examination(output.log, str(output.path), metadata, files, output.progress)
-
-
-def _no_grid(metadata: RunMetadata, what: str) -> dict[str, str]:
-    """The checks that are impossible without a rate."""
-    if metadata.rate is not None:
-        return {}
-    return dict.fromkeys(("grid", "index"), f"{what} no rate; {_NO_REPORT}")
-
-
-def _check_files(form: FileFormat, output: Output) -> Verdict:
+def _check_files(form: FileFormat, output: _Output) -> Verdict:
     log = output.log
     reader = form.reader(log)
-    files = _side_files(output)
+    output.read_side_files()
     scans = form.files(log, output.path)
     if not scans:
         found = log.violations[0] if log.violations else "none"
@@ -167,85 +161,72 @@ def _check_files(form: FileFormat, output: Output) -> Verdict:
         raise VerifyError(
             f"{scans[0].path}: {err}; restore the first scan, or convert again"
         ) from err
-    metadata = files.metadata(log, own)
-    reader.know(metadata)
-    examination = _examination(output, files, metadata)
+    output.limits |= form.limits
+    examination = output.examine(own, "rows have")
+    reader.know(output.metadata)
     for scan in reader.scans(scans):
         examination.scan(scan)
     examination.finish(split=scans[0].sensor is not None)
-    limits = dict(form.limits) | _no_grid(metadata, "rows have")
     if reader.organized:
-        limits |= npz.ORGANIZED_LIMITS
-    return output.verdict(form.name, examination, limits, files)
+        output.limits |= npz.ORGANIZED_LIMITS
+    return output.verdict(form.name)
 
 
-def _check_rosbag2(output: Output) -> Verdict:
+def _check_messages(kind: str, output: _Output) -> Verdict:
+    """Check a container of messages."""
+    log, path, name = output.log, output.path, output.path.name
+    if kind == "rosbag1":
+        from mlbatch.outputs.rosbag1 import LIMITS, BagFile
+
+        output.read_side_files(has_table=False)
+        if output.files.table is None:
+            reason = f"no {TABLE} next to the output"
+            output.limits |= dict.fromkeys(("columns", "table"), reason)
+        output.limits |= LIMITS
+        topics = TopicChecks(log, output.examine(RunMetadata(), "a bag has"), output.files.report)
+        topics.check_files([BagFile(log, path, name)], name)
+    else:
+        topics = _check_mcaps(output, is_bag=kind == "rosbag2")
+    output.limits = _limits(topics) | output.limits
+    return output.verdict(f"{kind}, {topics.layout}" if topics.layout else kind)
+
+
+def _check_mcaps(output: _Output, *, is_bag: bool) -> TopicChecks:
+    """Check an MCAP file, or those of a ROS 2 bag."""
     from mlbatch.outputs.rosbag2 import open_bag
+    from mlbatch.verification.indexes import CheckedMcap, check_metadata
 
-    paths, about = open_bag(output.log, output.path)
-    return _check_mcap(output, paths, "rosbag2", about)
-
-
-def _check_mcap(
-    output: Output, paths: Sequence[Path], name: str, about: Yaml | None = None
-) -> Verdict:
-    """about: metadata.yaml of a ROS 2 bag."""
-    from mlbatch.verification.indexes import BagFile, CheckedMcap, check_metadata
-
-    log = output.log
-    mcaps = []
-    for path in paths:
-        file = CheckedMcap(log, path)
+    log, path = output.log, output.path
+    paths, about = open_bag(log, path) if is_bag else ([path], None)
+    mcaps = [CheckedMcap(log, one) for one in paths]
+    for one, file in zip(paths, mcaps, strict=True):
         grid = file.metadata.get("mlbatch.grid")
         if grid is None:
             raise VerifyError(
-                f"{path}: expected an MCAP file of mlbatch, with a metadata record mlbatch.grid, "
+                f"{one}: expected an MCAP file of mlbatch, with a metadata record mlbatch.grid, "
                 f"found one of {file.library or 'an unknown writer'!r}; {_NAME_ONE}"
             )
-        if PIECES in grid and not output.path.is_dir():
+        if PIECES in grid and not path.is_dir():
             raise VerifyError(
-                f"{path}: expected a whole output, found one of the files of a bag; name its folder"
+                f"{one}: expected a whole output, found one of the files of a bag; name its folder"
             )
-        log.equal("metadata", f"{path.name} profile", "ros2", file.profile)
-        mcaps.append(file)
+        log.equal("metadata", f"{one.name} profile", "ros2", file.profile)
     first, *others = (file.metadata["mlbatch.grid"] for file in mcaps)
-    for path, grid in zip(paths[1:], others, strict=True):
-        log.equal("metadata", f"{path.name} mlbatch.grid", first, grid)
+    for one, grid in zip(paths[1:], others, strict=True):
+        log.equal("metadata", f"{one.name} mlbatch.grid", first, grid)
     if PIECES in first or others:
-        files = _side_files(output)
+        output.read_side_files()
     else:
         attachment = mcaps[0].attachments.get(TABLE)
         report = mcaps[0].metadata.get("mlbatch.report")
-        files = ReportFiles.inside(log, paths[0], report, attachment)
-        files.check_copies(log, attachment, output.files)
-    metadata = files.metadata(log, metadata_of_grid(log, paths[0].name, first))
-    topics = TopicChecks(log, metadata, _examination(output, files, metadata), files.report)
-    counts = topics.check_files(mcaps, output.path.name if others else paths[0].name)
+        output.files = ReportFiles.inside(log, paths[0], report, attachment)
+        output.files.check_copies(log, attachment, output.paths)
+    examination = output.examine(metadata_of_grid(log, paths[0].name, first))
+    topics = TopicChecks(log, examination, output.files.report)
+    counts = topics.check_files(mcaps, path.name if others else paths[0].name)
     if about is not None:
-        spans = (file.span_ns for file in mcaps)
-        names = (path.name for path in paths)
-        found = list(map(BagFile, names, counts, spans))
-        check_metadata(log, about, found, topics.counts)
-    return output.verdict(_format(name, topics), topics.examination, _limits(topics), files)
-
-
-def _check_bag(output: Output) -> Verdict:
-    from mlbatch.outputs.rosbag1 import LIMITS, BagFile
-
-    log = output.log
-    path = output.path
-    files = ReportFiles.read(log, output.files)
-    metadata = files.metadata(log, RunMetadata())
-    topics = TopicChecks(log, metadata, _examination(output, files, metadata), files.report)
-    topics.check_files([BagFile(log, path, path.name)], path.name)
-    limits = _limits(topics) | LIMITS | _no_grid(metadata, "a bag has")
-    if files.table is None:
-        limits |= dict.fromkeys(("columns", "table"), f"no {TABLE} next to the output")
-    return output.verdict(_format("rosbag1", topics), topics.examination, limits, files)
-
-
-def _format(name: str, topics: TopicChecks) -> str:
-    return f"{name}, {topics.layout}" if topics.layout else name
+        check_metadata(log, about, mcaps, counts, topics.counts)
+    return topics
 
 
 def _limits(topics: TopicChecks) -> dict[str, str]:
