@@ -75,7 +75,7 @@ NEEDLESS = (
     *("mlbatch.batching.fusion", "mlbatch.batching.sweeps", "mlbatch.pipeline.shards"),
     *("numpy.ma", "rosbags", "rich", "mcap.writer", "importlib.metadata"),
     *("mlbatch.readers.capture.odd", "dpkt", "mlbatch.page.templates", "jinja2"),
-    *("mlbatch.sensors.advice", "mlbatch.pipeline.segments", "mlbatch.pipeline.time_limits"),
+    *("mlbatch.sensors.advice", "mlbatch.pipeline.time_limits"),
     *("mlbatch.reports.limits", "mlbatch.pipeline.overlap", "mlbatch.discovery.overlap"),
 )
 
