@@ -26,9 +26,9 @@ RANGES = "ranges to 1 m: beams do not leave from the origin of their sensor"
 
 @dataclass(frozen=True, slots=True)
 class FileFormat:
-    """A format; suffix: of the first file of a scan; limits: as in `Output.verdict`.
+    """A format; suffix: of the first file of a scan.
 
-    inside: of a format whose files have several scans, see `scan_files`.
+    limits: why checks are not or only partly possible; inside: of a format whose files have several scans, see `scan_files`.
     """
 
     name: str
