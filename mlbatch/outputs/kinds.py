@@ -28,7 +28,8 @@ RANGES = "ranges to 1 m: beams do not leave from the origin of their sensor"
 class FileFormat:
     """A format; suffix: of the first file of a scan.
 
-    limits: why checks are not or only partly possible; inside: of a format whose files have several scans, see `scan_files`.
+    limits: why checks are not or only partly possible; inside: of a format whose files have several
+    scans, see `scan_files`.
     """
 
     name: str
