@@ -11,6 +11,8 @@ from typing import Any, Union, get_args, get_origin, get_type_hints
 
 import numpy as np
 
+from mlbatch.arrays import F64Array
+
 
 def to_json(value: object) -> object:
     """A record, or a value of its fields, as what `json.dumps` takes."""
@@ -51,7 +53,7 @@ def _reader(kind: Any, tolerant: bool) -> Read:
         (inner,) = (one for one in arguments if one is not NoneType)
         inside = _reader(inner, tolerant)
         return lambda found: None if found is None else inside(found)
-    if origin is np.ndarray:
+    if kind == F64Array:
         return lambda found: np.array(_of(list, found), np.float64)
     if origin is tuple and arguments[-1] is not Ellipsis:
         readers = [_reader(one, tolerant) for one in arguments]
@@ -113,7 +115,7 @@ def _nothing(kind: Any) -> object:
     origin = get_origin(kind)
     if origin in (Union, UnionType):
         return None
-    if origin is np.ndarray:
+    if kind == F64Array:
         return np.zeros(0)
     if (origin or kind) in (tuple, list, dict, bool, int, float, str):
         return (origin or kind)()
