@@ -29,7 +29,7 @@ def test_anything_else_is_named_at_once(tmp_path: Path) -> None:
         (tmp_path / "socket", "a socket"),
         (Path("/dev/zero"), "a device"),
         (tmp_path / "none", "No such file"),
-        (tmp_path / "a\0b", "null byte"),
+        (tmp_path / "a\0b", "null (byte|character)"),
     ):
         with pytest.raises(OSError, match=found):
             read_bytes(path)
