@@ -15,7 +15,9 @@ from typing import Any
 
 import numpy as np
 
+from mlbatch.simulate.velodyne.encode import VelodyneSpec
 from tests.builders.bags import Body, Recorded, transforms_message
+from tests.builders.lidar_packets import even
 from tests.builders.points import CLOUD, CUSTOM, Form, cloud_of, custom_message
 from tests.builders.rosbag1 import write_rosbag1
 from tests.builders.rosbag2 import write_folder
@@ -35,7 +37,8 @@ Times = Callable[[Any, int], Any]
 # The messages of a topic.
 Topic = list[Recorded]
 
-XYZI = {"x": "f4", "y": "f4", "z": "f4", "intensity": "f4"}
+XYZ = {"x": "f4", "y": "f4", "z": "f4"}
+XYZI = {**XYZ, "intensity": "f4"}
 OUSTER = {**XYZI, "t": "u4", "reflectivity": "u2", "ring": "u2", "ambient": "u2"}
 # The types that the manuals of NTU VIRAL and MCD publish.
 NTU = {**XYZI, "t": "u4", "reflectivity": "u2", "ring": "u1", "noise": "u2", "range": "u4"}
@@ -112,40 +115,17 @@ def customs(topic: str, clock_ns: int = 0) -> Topic:
 
 # A VelodyneScan of so many packets, about a sixth of a revolution.
 SCAN_PACKETS = 12
-SCANS = 60
-RAW = SCAN_PACKETS * SCANS
+RAW = 60 * SCAN_PACKETS
 HOUR_NS = 3600 * 10**9
-# Return mode and product, bytes 1204 and 1205; us of a packet; all by the manuals of Velodyne.
-PRODUCTS = {"HDL-32E": (0x21, 552.96), "VLP-16": (0x22, 1327.104), "VLS-128": (0xA1, 160.0)}
-_READINGS = np.dtype([("range", "<u2"), ("level", "u1")])
-_PACKET = np.dtype(
-    [
-        ("blocks", [("flag", "<u2"), ("azimuth", "<u2"), ("readings", _READINGS, 32)], 12),
-        ("us", "<u4"),
-        ("factory", "u1", 2),
-    ]
-)
 
 
 def scans(topic: str, model: str, frame: str, encoding: str = "ros1") -> Topic:
     """Raw packets of a Velodyne at 10 Hz, all ranges alike."""
-    product, packet_us = PRODUCTS[model]
-    # VLS-128: four blocks of 32 beams fire at one azimuth, with flags of their own.
-    at_once = 4 if model == "VLS-128" else 1
+    hour, rest_ns = divmod(START_NS, HOUR_NS)
+    sent = even(VelodyneSpec(model, hour=hour, start_us=rest_ns / 1000), RAW, 2000, 50)
     messages = []
-    for number in range(SCANS):
-        packets = []
-        for index in range(number * SCAN_PACKETS, (number + 1) * SCAN_PACKETS):
-            packet = np.zeros((), _PACKET)
-            at_us = index * packet_us
-            first_us = at_us + np.arange(12) // at_once * (packet_us / 12 * at_once)
-            packet["blocks"]["flag"] = ([0xEEFF, 0xDDFF, 0xCCFF, 0xBBFF][:at_once] * 12)[:12]
-            packet["blocks"]["azimuth"] = (first_us / 1e5 * 36000).astype(int) % 36000
-            packet["blocks"]["readings"]["range"] = 2000
-            packet["blocks"]["readings"]["level"] = 50
-            packet["us"] = int(START_NS % HOUR_NS / 1000 + at_us)
-            packet["factory"] = (0x37, product)
-            packets.append((START_NS + round((at_us + packet_us) * 1000), packet.tobytes()))
+    for at in range(0, RAW, SCAN_PACKETS):
+        packets = sent[at : at + SCAN_PACKETS]
         last_ns = packets[-1][0]
         body = Body(encoding).header(last_ns, frame).put("I", len(packets))
         for stamp_ns, data in packets:
@@ -203,11 +183,12 @@ def upright(x: float, y: float, z: float) -> list[float]:
     return [1.0, 0.0, 0.0, x, 0.0, 1.0, 0.0, y, 0.0, 0.0, 1.0, z, 0.0, 0.0, 0.0, 1.0]
 
 
-def files(folder: str, name: Callable[[int], str], data: Callable[[int], bytes]) -> None:
-    """A file for each sweep, by its start."""
+def files(folder: str, name: str, data: Mapping[int, bytes] | bytes) -> None:
+    """A file for each sweep; name: with ns, us, middle_us or number; data: by start, or of all."""
     Path(folder).mkdir(parents=True, exist_ok=True)
-    for start in starts():
-        (Path(folder) / name(start)).write_bytes(data(start))
+    for number, ns in enumerate(starts()):
+        place = name.format(ns=ns, us=ns // 1000, middle_us=ns // 1000 + 50_000, number=number)
+        (Path(folder) / place).write_bytes(data if isinstance(data, bytes) else data[ns])
 
 
 # -- datasets -------------------------------------------------------------------------------------
@@ -354,24 +335,14 @@ def m3dgr() -> None:
 
 
 # Rounded to four digits, as in cali/alpha_config.yaml.
-ALPHA = [
-    0.9999,
-    0.0049,
-    0.0153,
-    0.0961,
-    -0.0050,
-    1.0000,
-    0.0021,
-    -0.1338,
-    -0.0153,
-    -0.0022,
-    0.9999,
-    0.3032,
-    0.0,
-    0.0,
-    0.0,
-    1.0,
-]
+ALPHA = np.array(
+    (
+        (0.9999, 0.0049, 0.0153, 0.0961),
+        (-0.0050, 1.0000, 0.0021, -0.1338),
+        (-0.0153, -0.0022, 0.9999, 0.3032),
+        (0.0, 0.0, 0.0, 1.0),
+    )
+)
 
 
 def geode() -> None:
@@ -383,7 +354,7 @@ def geode() -> None:
     opencv(
         "cali/alpha_config.yaml",
         head=f"# Left\n{camera}# Right\n{camera}{noise}",
-        T_IMU_LiDAR=ALPHA,
+        T_IMU_LiDAR=ALPHA.reshape(-1).tolist(),
     )
     bag("Urban_alpha.bag", clouds("/velodyne_points", VELODYNE, before_end_s, header_ns=LAST))
     bag("Urban_beta.bag", clouds("/ouster/points", OUSTER, after_start_ns))
@@ -443,46 +414,20 @@ def urban_nav() -> None:
     )
 
 
+_AVIA = {**XYZ, "reflectivity": "u1", "tag": "u1", "line": "u1", "offset_time": "u4"}
+_AEVA = {**XYZ, "reflectivity": "f4", "velocity": "f4", "time_offset_ns": "i4"}
 HELIPR = {
     "Ouster": (OUSTER, after_start_ns),
     "Velodyne": (VELODYNE, after_start_s),
-    "Avia": (
-        {
-            "x": "f4",
-            "y": "f4",
-            "z": "f4",
-            "reflectivity": "u1",
-            "tag": "u1",
-            "line": "u1",
-            "offset_time": "u4",
-        },
-        after_start_ns,
-    ),
-    "Aeva": (
-        {
-            "x": "f4",
-            "y": "f4",
-            "z": "f4",
-            "reflectivity": "f4",
-            "velocity": "f4",
-            "time_offset_ns": "i4",
-            "line_index": "u1",
-            "intensity": "f4",
-        },
-        after_start_ns,
-    ),
+    "Avia": (_AVIA, after_start_ns),
+    "Aeva": ({**_AEVA, "line_index": "u1", "intensity": "f4"}, after_start_ns),
 }
-
-
-def _helipr(name: str) -> None:
-    data = rows(*HELIPR[name]).tobytes()
-    files(f"Roundabout01/LiDAR/{name}", lambda start: f"{start}.bin", lambda _: data)
 
 
 def helipr() -> None:
     """A folder of raw points for each lidar."""
-    for name in HELIPR:
-        _helipr(name)
+    for name, (fields, time) in HELIPR.items():
+        files(f"Roundabout01/LiDAR/{name}", "{ns}.bin", rows(fields, time).tobytes())
 
 
 VIEWS = ("frontcenter", "frontleft", "frontright", "sideleft", "sideright", "rearcenter")
@@ -506,53 +451,29 @@ def a2d2() -> None:
 
 def boreas() -> None:
     """Six float32 a point; the name is the middle of the scan in us, times count from it."""
-    fields = {"x": "f4", "y": "f4", "z": "f4", "intensity": "f4", "ring": "f4", "t": "f4"}
+    fields = {**XYZI, "ring": "f4", "t": "f4"}
     data = rows(fields, lambda column, _: (column - 50) / 1000).tobytes()
     text("boreas-2021-09-02-11-42/applanix/lidar_poses.csv", "GPSTime,easting,northing\n")
-    files(
-        "boreas-2021-09-02-11-42/lidar",
-        lambda start: f"{(start + 50 * MS) // 1000}.bin",
-        lambda _: data,
-    )
+    files("boreas-2021-09-02-11-42/lidar", "{middle_us}.bin", data)
 
 
-TRUCK = (
-    "LIDAR_LEFT",
-    "LIDAR_RIGHT",
-    "LIDAR_TOP_FRONT",
-    "LIDAR_TOP_LEFT",
-    "LIDAR_TOP_RIGHT",
-    "LIDAR_REAR",
-)
-
-
-def _truck(name: str) -> None:
-    fields = {**XYZI, "timestamp": "u8"}
-    files(
-        f"man-truckscenes/sweeps/{name}",
-        lambda start: f"{name}_{start // 1000}.pcd",
-        lambda start: pcd(fields, rows(fields, since_1970_us, start).tolist()),
-    )
+_PLACES = ("LEFT", "RIGHT", "TOP_FRONT", "TOP_LEFT", "TOP_RIGHT", "REAR")
+TRUCK = tuple(f"LIDAR_{place}" for place in _PLACES)
 
 
 def truckscenes() -> None:
     """PCD with a uint64 time in us since 1970."""
+    fields = {**XYZI, "timestamp": "u8"}
+    data = {ns: pcd(fields, rows(fields, since_1970_us, ns).tolist()) for ns in starts()}
     for name in TRUCK:
-        _truck(name)
+        files(f"man-truckscenes/sweeps/{name}", name + "_{us}.pcd", data)
 
 
 def zenseact() -> None:
     """A structured .npy; int64 us from the core time in the name, here the middle."""
     place = Path("sequences/000000/lidar_velodyne")
     place.mkdir(parents=True, exist_ok=True)
-    fields = {
-        "x": "f4",
-        "y": "f4",
-        "z": "f4",
-        "timestamp": "i8",
-        "intensity": "u1",
-        "diode_index": "u1",
-    }
+    fields = {**XYZ, "timestamp": "i8", "intensity": "u1", "diode_index": "u1"}
     for start in starts():
         middle = datetime.fromtimestamp((start + 50 * MS) / 1e9, timezone.utc)
         name = middle.strftime("000000_india_%Y-%m-%dT%H:%M:%S.%fZ.npy")
@@ -562,52 +483,41 @@ def zenseact() -> None:
 def nuscenes() -> None:
     """Five float32 a point, no time."""
     data = np.tile(np.array([1, 0, 0, 9, 1], "<f4"), 100).tobytes()
-    files(
-        "nuscenes/sweeps/LIDAR_TOP",
-        lambda start: f"n015-2018-07-24-11-22-45+0800__LIDAR_TOP__{start // 1000}.pcd.bin",
-        lambda _: data,
-    )
+    name = "n015-2018-07-24-11-22-45+0800__LIDAR_TOP__{us}.pcd.bin"
+    files("nuscenes/sweeps/LIDAR_TOP", name, data)
 
 
 def complex_urban() -> None:
     """Raw points without times."""
     data = np.tile(np.array([1, 0, 0, 9], "<f4"), 100).tobytes()
     for side in ("left", "right"):
-        files(f"urban08/sensor_data/VLP_{side}", lambda start: f"{start}.bin", lambda _: data)
+        files(f"urban08/sensor_data/VLP_{side}", "{ns}.bin", data)
 
 
 def nuplan() -> None:
     """PCD files of merged lidars, without times."""
     fields = {**XYZI, "ring": "f4", "lidar_info": "f4"}
     data = pcd(fields, rows(fields, after_start_s).tolist())
-    files(
-        "sensor_blobs/MergedPointCloud", lambda start: f"{start // 1000:016x}.pcd", lambda _: data
-    )
+    files("sensor_blobs/MergedPointCloud", "{us:016x}.pcd", data)
 
 
 def lyft() -> None:
     """Raw points without times."""
     data = np.tile(np.array([1, 0, 0, 9, 1], "<f4"), 100).tobytes()
-    files(
-        "v1.01-train/lidar", lambda start: f"host-a007_lidar1_{start // 1000}.bin", lambda _: data
-    )
+    files("v1.01-train/lidar", "host-a007_lidar1_{us}.bin", data)
 
 
 def waymo() -> None:
     """Range images in TFRecords."""
-    files("waymo", lambda start: f"segment-{start}.tfrecord", lambda _: bytes(100))
+    files("waymo", "segment-{ns}.tfrecord", bytes(100))
 
 
 def argoverse2() -> None:
     """Tables of Arrow."""
-    files("sensors/lidar", lambda start: f"{start}.feather", lambda _: b"ARROW1\0\0" + bytes(99))
+    files("sensors/lidar", "{ns}.feather", b"ARROW1\0\0" + bytes(99))
 
 
 def pandaset() -> None:
     """Pickles."""
     text("001/meta/timestamps.json", json.dumps([start / 1e9 for start in starts()]))
-    files(
-        "001/lidar",
-        lambda start: f"{(start - START_NS) // SWEEP:02d}.pkl.gz",
-        lambda _: gzip.compress(b"\x80\x04]\x94."),
-    )
+    files("001/lidar", "{number:02d}.pkl.gz", gzip.compress(b"\x80\x04]\x94."))

@@ -8,22 +8,18 @@ returns. The receive time of a packet is the timestamp of its last column: no tr
 
 from __future__ import annotations
 
-import json
 import sys
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
-from mlbatch.simulate.ouster.encode import OusterSpec, encode_packets, metadata_json
+from mlbatch.simulate.ouster.encode import OusterSpec, encode_packets
 from tests.builders.captures import udp_frame, write_pcap
+from tests.builders.sessions import EPOCH_NS, NS_PER_MS, NS_PER_S, SMALL, write_metadata
 
-NS_PER_S = 10**9
-NS_PER_MS = 10**6
-# A whole number of periods of 10 Hz and of 20 Hz; the rotors pass zero some time after it.
-EPOCH_NS = 1_800_000_000 * NS_PER_S
-BEAMS = 4
+# The epoch is a whole number of periods of 10 Hz and of 20 Hz; rotors pass zero some time after it.
 COLUMNS = 512
 REVOLUTION_NS = 100 * NS_PER_MS
 
@@ -43,14 +39,9 @@ class Rotor:
     @property
     def spec(self) -> OusterSpec:
         """The sensor that the packets and the metadata are of."""
-        return OusterSpec(
-            beams=BEAMS,
-            columns_per_frame=COLUMNS,
-            rate_hz=round(NS_PER_S / self.revolution_ns),
-            serial=self.serial,
-            init_id=self.serial,
-            with_crc=False,
-        )
+        rate_hz = round(NS_PER_S / self.revolution_ns)
+        own = replace(SMALL, serial=self.serial, init_id=self.serial)
+        return replace(own, beams=4, rate_hz=rate_hz, with_crc=False)
 
     def packets(self, seconds: float) -> Iterator[tuple[int, bytes]]:
         """(receive time in ns, payload) of all packets of the whole revolutions in `seconds`."""
@@ -71,47 +62,33 @@ class Rotor:
                 yield last_ns, payload
 
 
-@dataclass(frozen=True, slots=True)
-class Case:
-    """Two rotors, and for how long they are recorded."""
-
-    left: Rotor
-    right: Rotor
-    seconds: float = 10.0
-
-
-LEFT = 1001
 RIGHT = 1002
-CASES: dict[str, Case] = {
-    "10 Hz, in phase": Case(Rotor(LEFT), Rotor(RIGHT)),
-    "10 Hz, 37 ms apart": Case(Rotor(LEFT), Rotor(RIGHT, 57)),
-    "10 Hz, 63 ms apart": Case(Rotor(LEFT), Rotor(RIGHT, 83)),
-    "10 Hz with 20 Hz": Case(Rotor(LEFT), Rotor(RIGHT, revolution_ns=REVOLUTION_NS // 2)),
-    "10.00 Hz with 9.95 Hz": Case(Rotor(LEFT), Rotor(RIGHT, revolution_ns=100_502_513), 60.0),
-    "10 Hz, one silent from 5 s to 8 s": Case(Rotor(LEFT), Rotor(RIGHT, silent_s=(5.0, 8.0))),
+# The right rotor, and for how many seconds it and the left one are recorded.
+CASES: dict[str, tuple[Rotor, float]] = {
+    "10 Hz, in phase": (Rotor(RIGHT), 10.0),
+    "10 Hz, 37 ms apart": (Rotor(RIGHT, 57), 10.0),
+    "10 Hz, 63 ms apart": (Rotor(RIGHT, 83), 10.0),
+    "10 Hz with 20 Hz": (Rotor(RIGHT, revolution_ns=REVOLUTION_NS // 2), 10.0),
+    "10.00 Hz with 9.95 Hz": (Rotor(RIGHT, revolution_ns=100_502_513), 60.0),
+    "10 Hz, one silent from 5 s to 8 s": (Rotor(RIGHT, silent_s=(5.0, 8.0)), 10.0),
 }
 
 
-def write_case(folder: Path, case: Case) -> Path:
-    """A capture of the case in `folder`, with its metadata file."""
-    folder.mkdir(parents=True, exist_ok=True)
+def write_case(folder: Path, name: str) -> Path:
+    """A capture of the case, and metadata, in a folder of its own in `folder`."""
+    own = folder / "".join(letter if letter.isalnum() else "_" for letter in name)
+    own.mkdir(parents=True, exist_ok=True)
+    right, seconds = CASES[name]
     records = []
-    for number, rotor in enumerate((case.left, case.right), 1):
-        (folder / f"{rotor.serial}.json").write_text(
-            json.dumps(metadata_json(rotor.spec)), encoding="utf-8"
-        )
+    for number, rotor in enumerate((Rotor(1001), right), 1):
+        write_metadata(own / f"{rotor.serial}.json", rotor.spec)
         records += [
             (host_ns, udp_frame(payload, f"10.0.0.{number}")[0])
-            for host_ns, payload in rotor.packets(case.seconds)
+            for host_ns, payload in rotor.packets(seconds)
         ]
-    return write_pcap(folder / "drive.pcap", sorted(records, key=lambda record: record[0]))
-
-
-def slug(name: str) -> str:
-    """The name of a case as that of a folder."""
-    return "".join(letter if letter.isalnum() else "_" for letter in name)
+    return write_pcap(own / "drive.pcap", sorted(records, key=lambda record: record[0]))
 
 
 if __name__ == "__main__":
-    for title, one in CASES.items():
-        write_case(Path(sys.argv[1]) / slug(title), one)
+    for title in CASES:
+        write_case(Path(sys.argv[1]), title)

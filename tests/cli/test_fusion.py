@@ -13,7 +13,7 @@ from mcap.reader import make_reader
 import mlbatch
 from mlbatch.comparison.compare import compare
 from mlbatch.pipeline.job import Job
-from tests.builders.phases import CASES, write_case
+from tests.builders.phases import write_case
 from tests.builders.sessions import CAPTURE, RIG, Shell, arrays, names, report_of
 
 WORDS = f"convert {CAPTURE} --rig {RIG} -q"
@@ -32,7 +32,7 @@ NS = 10**9
 @pytest.mark.parametrize("case", ["10 Hz, 37 ms apart", "10 Hz with 20 Hz"])
 def test_sets_are_those_of_compare(shell: Shell, policy: str, case: str) -> None:
     """`compare` measures the sets that `convert` writes."""
-    capture = write_case(Path("case"), CASES[case])
+    capture = write_case(Path("case"), case)
     words = f"convert {capture} --identity-extrinsics -q --report report.json"
     assert shell(f"{words} --batching {policy} -o sets").code == 0
     own = next(one for one in compare(Job((capture,))).reports if one.name == POLICIES[policy])
@@ -118,7 +118,7 @@ def test_the_report_says_that_it_is_frame_level_fusion(shell: Shell) -> None:
 
 def test_reused_columns_are_counted(shell: Shell) -> None:
     """The slower one repeats a sweep once in 20 s, seen from the faster one."""
-    capture = write_case(Path("case"), CASES["10.00 Hz with 9.95 Hz"])
+    capture = write_case(Path("case"), "10.00 Hz with 9.95 Hz")
     assert shell(f"convert {capture} --identity-extrinsics --batching latest -o out -q").code == 0
     left, right = report_of("out/report.json")["sensors"]
     assert left["columns"].get("reused", 0) == 0

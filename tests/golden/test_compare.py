@@ -13,7 +13,7 @@ import pytest
 from mlbatch.comparison.compare import WINDOWS, Comparison, compare
 from mlbatch.page.policies import PolicyFigures
 from mlbatch.pipeline.job import Job
-from tests.builders.phases import CASES, slug, write_case
+from tests.builders.phases import CASES, write_case
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGE = ROOT / "docs" / "compare.md"
@@ -26,9 +26,7 @@ SWEEP_MS = 99.804687
 @pytest.fixture(scope="module")
 def found(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Comparison]:
     folder = tmp_path_factory.mktemp("phases")
-    return {
-        name: compare(Job((write_case(folder / slug(name), case),))) for name, case in CASES.items()
-    }
+    return {name: compare(Job((write_case(folder, name),))) for name in CASES}
 
 
 def _policy(found: dict[str, Comparison], case: str, policy: str) -> PolicyFigures:
@@ -51,7 +49,7 @@ def test_windows_span_one_period_and_use_each_column_once(
     assert _spans_ms(ours)[1] < 100
     assert (ours.stale, ours.used_twice, ours.never_used) == (0, 0, 0)
     # From t_init at 100 ms; the last window holds the last stamp, and is left out.
-    assert ours.sets == CASES[case].seconds * 10 - 2
+    assert ours.sets == CASES[case][1] * 10 - 2
 
 
 @pytest.mark.parametrize(

@@ -16,7 +16,6 @@ from rosbags.typesys import Stores, get_typestore
 
 import mlbatch
 from mlbatch.errors import ExportError, UsageError
-from mlbatch.rig.rig import read_rig
 from mlbatch.simulate.recording import write_recording
 from mlbatch.simulate.scenario import SHIPPED, read_scenario, shipped
 from mlbatch.units import STANDARD_GRAVITY
@@ -126,16 +125,6 @@ def test_every_container_gives_the_same_scans(bags: dict[str, Recorded]) -> None
         for one, other in zip(scans, first, strict=True):
             np.testing.assert_array_equal(one.xyz, other.xyz)
             np.testing.assert_array_equal(one.time_ns, other.time_ns)
-
-
-def test_the_rig_is_that_of_the_scenario(bags: dict[str, Recorded]) -> None:
-    for recorded in bags.values():
-        rig = read_rig(recorded.rig)
-        for sensor, plan in zip(rig.sensors, recorded.scenario.lidars, strict=True):
-            assert sensor.name == plan.name
-            np.testing.assert_allclose(
-                np.asarray(sensor.extrinsics), plan.body_from_sensor, atol=1e-8
-            )
 
 
 def test_files_have_their_names(bags: dict[str, Recorded]) -> None:

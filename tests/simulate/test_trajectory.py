@@ -9,7 +9,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mlbatch.arrays import F64Array
 from mlbatch.simulate.terrain import Terrain
 from mlbatch.simulate.trajectory import (
     RAMP_S,
@@ -89,13 +88,6 @@ def test_the_body_stands_and_then_reaches_full_speed() -> None:
     assert trajectory.end_s == pytest.approx(13.0 + RAMP_S / 2)
 
 
-def circle(time_s: F64Array) -> Trajectory:
-    """2 m around the origin at 1 rad/s, looking ahead."""
-    knots = np.linspace(0, 2 * math.pi, 400)
-    rows = np.column_stack([2 * np.cos(knots), 2 * np.sin(knots), 0 * knots])
-    return Trajectory(path_from_waypoints(knots, rows, knots + math.pi / 2))
-
-
 def test_an_imu_at_rest_feels_gravity() -> None:
     tilted = np.eye(4)
     # x of the IMU points up.
@@ -103,21 +95,6 @@ def test_an_imu_at_rest_feels_gravity() -> None:
     force, rate = Trajectory(path((0, 0, 0, 0, 0))).inertial(np.array([1.0]), tilted)
     np.testing.assert_allclose(force, [[STANDARD_GRAVITY, 0, 0]], atol=1e-9)
     np.testing.assert_allclose(rate, [[0, 0, 0]], atol=1e-12)
-
-
-@pytest.mark.parametrize(
-    ("arm", "radius"), [((0.0, 0.0, 0.0), 2.0), ((0.0, 0.5, 0.0), 1.5), ((0.0, -1.0, 0.3), 3.0)]
-)
-def test_an_imu_on_a_circle_feels_what_its_own_place_does(
-    arm: tuple[float, float, float], radius: float
-) -> None:
-    """The centre is to the left: centripetal acceleration of its own radius, at 1 rad/s."""
-    place = np.eye(4)
-    place[:3, 3] = arm
-    times = np.array([2.0, 3.0, 4.0])
-    force, rate = circle(times).inertial(times, place)
-    np.testing.assert_allclose(force, UP + [[0, radius, 0]] * 3, atol=2e-3)
-    np.testing.assert_allclose(rate, [[0, 0, 1]] * 3, atol=1e-5)
 
 
 def test_the_specific_force_is_that_of_the_place_of_the_imu() -> None:
