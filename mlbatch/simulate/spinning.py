@@ -25,68 +25,32 @@ class SpinningSpec(ABC):
     """A unit to imitate: the shots of its columns, and packets of what they measured.
 
     A column is a firing of all channels (HESAI: of a group of blocks); column k is the k-th that is
-    sent. Packets take places and forms of fields from the encoder's own tables; angles and firing
-    times come from the model's row in `mlbatch/sensors`, which the tests compare with the
-    document. The angles of a unit, where models have none, are made up.
+    sent. Places of fields, angles and firing times come from the model's row in `mlbatch/sensors`,
+    which tests compare with the documents and with bytes laid out by hand. The angles of a unit,
+    where models have none, are made up.
     """
 
-    model: str  # a row of the encoder's table
-    mode: str  # of returns
-    topics: ClassVar[Mapping[int, PacketTopic]]
     # Where packets of the device go.
     device_port: ClassVar[int] = 0
     # Packets after which firing tables and status bytes repeat, and columns and ns are whole.
     chunk_packets: ClassVar[int] = 60
+    topics: ClassVar[Mapping[int, PacketTopic]]
+    model: str  # a row of the encoder's table
+    mode: str  # of returns
 
-    @property
-    @abstractmethod
-    def reported_model(self) -> str:
-        """Name of its model in `mlbatch sensors`."""
-
-    @property
-    def rig_model(self) -> str:
-        """Name of the model as in a rig, "" if packets identify it."""
-        return ""
-
-    @property
-    def device_period_ns(self) -> int:
-        """From packet to packet of the device; 0: it sends none."""
-        return 0
-
-    @property
-    @abstractmethod
-    def channels(self) -> int:
-        """Shots of a column."""
-
-    @property
-    @abstractmethod
-    def returns(self) -> int:
-        """Returns of a shot."""
-
-    @property
-    @abstractmethod
-    def columns_per_packet(self) -> float:
-        """Columns of a packet, not whole where packets share one."""
-
-    @property
-    @abstractmethod
-    def column_ns(self) -> float:
-        """From column to column."""
-
-    @property
-    @abstractmethod
-    def range_unit_m(self) -> float:
-        """Metres of a count of range."""
-
-    @property
-    def largest(self) -> int:
-        """Largest count of range."""
-        return 65535
-
-    @property
-    def range_offset_m(self) -> F64Array:
-        """(channels,) or (1,) what ranges are short of the distance from the beam's origin."""
-        return np.zeros(1)
+    # What follows from the fields of a vendor's specification, which it sets in `__post_init__`.
+    reported_model: str  # in `mlbatch sensors`
+    rig_model: str = ""  # as in a rig, "" if packets identify it
+    channels: int  # shots of a column
+    returns: int  # of a shot
+    columns_per_packet: float  # not whole where packets share one
+    column_ns: float  # from column to column
+    range_unit_m: float  # of a count of range
+    largest: int = 65535  # count of range
+    # (channels,) or (1,) what ranges are short of the distance from the beam's origin.
+    range_offset_m: F64Array = np.zeros(1)
+    device_period_ns: int = 0  # from packet to packet of the device; 0: it sends none
+    begin_ns: int  # of the start, by the sensor's clock
 
     @property
     def files(self) -> LidarFiles:
@@ -136,11 +100,6 @@ class SpinningSpec(ABC):
     def device_packet(self, after_ns: int) -> bytes:
         """A packet of the device, so long after the start."""
         raise NotImplementedError
-
-    @property
-    @abstractmethod
-    def begin_ns(self) -> int:
-        """Time of the start, by the sensor's clock."""
 
 
 class SimulatedSpinner(SimulatedLidar):

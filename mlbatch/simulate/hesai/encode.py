@@ -148,40 +148,21 @@ class HesaiSpec(SpinningSpec):
         """The model's layout, with what the spec chooses."""
         return _row(self.model, self.operation, self.flags)
 
-    @property
-    def reported_model(self) -> str:
-        """Name of the row."""
-        return self.row.row.name
+    def __post_init__(self) -> None:
+        vars(self).update(
+            reported_model=self.row.row.name,
+            channels=self.row.row.channels,
+            returns=MODES[self.mode][1],
+            columns_per_packet=self.groups,
+            column_ns=float(self.row.step_ns),
+            range_unit_m=self.row.unit_mm / 1000.0,
+            begin_ns=self.start_ns,
+        )
 
     @property
-    def channels(self) -> int:
-        """Channels of a block."""
-        return self.row.row.channels
-
-    @property
-    def returns(self) -> int:
-        """Blocks of a group."""
-        return MODES[self.mode][1]
-
-    @property
-    def columns_per_packet(self) -> int:
-        """Groups of blocks with an azimuth each."""
-        return self.row.blocks // self.returns
-
-    @property
-    def column_ns(self) -> float:
-        """From group to group."""
-        return float(self.row.step_ns)
-
-    @property
-    def range_unit_m(self) -> float:
-        """Metres of a count of range."""
-        return self.row.unit_mm / 1000.0
-
-    @property
-    def begin_ns(self) -> int:
-        """Time of the first packet."""
-        return self.start_ns
+    def groups(self) -> int:
+        """Groups of blocks of a packet, with an azimuth each."""
+        return self.row.blocks // MODES[self.mode][1]
 
     @property
     def beams(self) -> Angles | MirrorAngles:
@@ -206,7 +187,7 @@ class HesaiSpec(SpinningSpec):
     def advanced(self, packets: int) -> HesaiSpec:
         """The lidar as it is so many packets later; ValueError if that is no whole ns."""
         row = self.row
-        after_ns = row.step_ns * packets * self.columns_per_packet
+        after_ns = row.step_ns * packets * self.groups
         if after_ns.denominator != 1:
             raise ValueError(f"{packets} packets last {after_ns} ns, no whole number")
         turned_deg = float(after_ns * self.rpm * 6 % (360 * 10**9)) * 1e-9
@@ -257,9 +238,9 @@ class HesaiSpec(SpinningSpec):
         row = self.row
         lead, azimuth_at = row.row.lead, row.row.azimuth_at
         columns = len(counts)
-        packets = columns // self.columns_per_packet
+        packets = columns // self.groups
         if counts.shape != self.shape(packets):
-            raise ValueError(f"{counts.shape}: no whole packets of {self.columns_per_packet}")
+            raise ValueError(f"{counts.shape}: no whole packets of {self.groups}")
         blocks = np.zeros((columns, self.returns, row.stride), np.uint8)
         units = np.rint(self.azimuths_deg(columns) * row.units_per_deg).astype(np.int64)
         # The AT128's finer azimuth: two bytes of 1/100 deg, then one of 1/25600.
@@ -295,7 +276,7 @@ def _row(model: str, operation: str, flags: int | None) -> HesaiModel:
 
 def _packet_times_ns(spec: HesaiSpec, packets: int) -> I64Array:
     """(P,) what the packets say: whole microseconds."""
-    step_ns = spec.row.step_ns * spec.columns_per_packet
+    step_ns = spec.row.step_ns * spec.groups
     after_ns = np.arange(packets) * step_ns.numerator // step_ns.denominator
     times: I64Array = (spec.start_ns + after_ns) // 1000 * 1000
     return times
@@ -304,7 +285,7 @@ def _packet_times_ns(spec: HesaiSpec, packets: int) -> I64Array:
 def _block_times_ns(spec: HesaiSpec, columns: int) -> I64Array:
     """(n,) packet time and offset of the block, by section 5."""
     timing, step_ns = spec.row.row.timing, spec.row.step_ns
-    groups = spec.columns_per_packet
+    groups = spec.groups
     packet, group = np.divmod(np.arange(columns), groups)
     if timing.counts_back:
         # (last block - b) // returns; the blocks of a group give the same.
@@ -366,7 +347,7 @@ def _assembled(spec: HesaiSpec, number: int, time_ns: int, body: bytes) -> bytes
 def _tail(spec: HesaiSpec, number: int, time_ns: int) -> bytes:
     place = spec.row.row.tail
     tail = bytearray(place.size)
-    first = number * spec.columns_per_packet
+    first = number * spec.groups
     states = OPERATIONS[spec.operation][1]
     each = [(first + block // spec.returns) % states for block in range(spec.row.blocks)]
     state = sum(one << 14 >> 2 * block for block, one in enumerate(each))

@@ -84,30 +84,22 @@ class RobosenseSpec(SpinningSpec):
         """Whether ranges have flags, and firing times depend on the mount."""
         return self.model.startswith("Airy")
 
-    @property
-    def reported_model(self) -> str:
-        """Name of the row."""
-        return self.row.row.name
-
-    @property
-    def channels(self) -> int:
-        """Channels of a round."""
-        return self.row.row.channels
-
-    @property
-    def returns(self) -> int:
-        """Of a shot."""
-        return 2 if self.mode == DUAL else 1
-
-    @property
-    def range_unit_m(self) -> float:
-        """Metres of a count of range."""
-        return 1 / self.row.row.units_per_m
-
-    @property
-    def largest(self) -> int:
-        """Largest count of range: 14 bits of an Airy."""
-        return 0x3FFF if self.is_airy else super().largest
+    def __post_init__(self) -> None:
+        row, layout = self.row.row, self.row.layout
+        returns = 2 if self.mode == DUAL else 1
+        vars(self).update(
+            reported_model=row.name,
+            channels=row.channels,
+            returns=returns,
+            # Half of a packet's columns may be the rest of a dual one of 128 lines.
+            columns_per_packet=layout.blocks * layout.per_block / (row.channels * returns),
+            column_ns=row.round_ns,
+            range_unit_m=1 / row.units_per_m,
+            # 14 bits of an Airy.
+            largest=row.range_mask,
+            device_period_ns=NS_PER_S // 10,
+            begin_ns=self.start_ns,
+        )
 
     @property
     def firing_ns(self) -> I64Array:
@@ -120,27 +112,6 @@ class RobosenseSpec(SpinningSpec):
     def round_ns(self) -> int:
         """From round to round."""
         return self.row.row.round_ns
-
-    @property
-    def column_ns(self) -> float:
-        """From round to round."""
-        return self.round_ns
-
-    @property
-    def columns_per_packet(self) -> float:
-        """Half of a packet's columns may be the rest of a dual one of 128 lines."""
-        layout = self.row.layout
-        return layout.blocks * layout.per_block / (self.channels * self.returns)
-
-    @property
-    def device_period_ns(self) -> int:
-        """Ten device packets per second."""
-        return NS_PER_S // 10
-
-    @property
-    def begin_ns(self) -> int:
-        """Time of round 0."""
-        return self.start_ns
 
     @property
     def angles(self) -> Angles:

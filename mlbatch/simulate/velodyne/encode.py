@@ -63,53 +63,24 @@ class VelodyneSpec(SpinningSpec):
         """The unit's beams and packets."""
         return MODELS[self.model]
 
-    @property
-    def reported_model(self) -> str:
-        """Name of the row."""
-        return self.table.row.name
-
-    @property
-    def rig_model(self) -> str:
-        """Nothing in packets distinguishes the series of an HDL-64E, or a Puck LITE."""
-        row = self.table.row
-        return row.name if row.needs_file or row.reported_as != row.name else ""
-
-    @property
-    def device_period_ns(self) -> int:
-        """The HDL-64E has no position packets (section 8)."""
-        return 0 if self.table.row.needs_file else 500_000_000
-
-    @property
-    def channels(self) -> int:
-        """Lasers."""
-        return len(self.table.elevation_deg)
-
-    @property
-    def returns(self) -> int:
-        """Returns of a column."""
-        return 2 if self.mode == "dual" else 1
-
-    @property
-    def range_unit_m(self) -> float:
-        """Metres of a count of range."""
-        return self.table.unit_m
-
-    @property
-    def range_offset_m(self) -> F64Array:
-        """(lasers,) corrections of distances."""
-        return np.array(self.table.dist_m)
-
-    @property
-    def files(self) -> LidarFiles:
-        """The HDL-64E has a calibration of each unit."""
-        if not self.table.row.needs_file:
-            return LidarFiles()
-        return LidarFiles("yaml", calibration_yaml(self.model).encode())
-
-    @property
-    def begin_ns(self) -> int:
-        """Time of the first firing."""
-        return round(self.start_us * NS_PER_US) + self.hour * HOUR_US * NS_PER_US
+    def __post_init__(self) -> None:
+        table, row = self.table, self.table.row
+        # Nothing in packets distinguishes the series of an HDL-64E, or a Puck LITE.
+        is_unnamed = row.needs_file or row.reported_as != row.name
+        vars(self).update(
+            reported_model=row.name,
+            rig_model=row.name if is_unnamed else "",
+            channels=row.lasers,
+            returns=2 if self.mode == "dual" else 1,
+            column_ns=(self.sequence_us or table.sequence_us) * NS_PER_US,
+            range_unit_m=table.unit_m,
+            # Corrections of distances.
+            range_offset_m=np.array(table.dist_m),
+            # The HDL-64E has no position packets (section 8).
+            device_period_ns=0 if row.needs_file else 500_000_000,
+            begin_ns=round(self.start_us * NS_PER_US) + self.hour * HOUR_US * NS_PER_US,
+        )
+        vars(self).update(columns_per_packet=self.rows_per_packet * table.form.columns_per_row)
 
     @property
     def row_us(self) -> float:
@@ -117,19 +88,16 @@ class VelodyneSpec(SpinningSpec):
         return (self.sequence_us or self.table.sequence_us) * self.table.form.columns_per_row
 
     @property
-    def column_ns(self) -> float:
-        """Of a sequence, without a blind sector."""
-        return (self.sequence_us or self.table.sequence_us) * NS_PER_US
-
-    @property
     def rows_per_packet(self) -> int:
         """Azimuths of a packet."""
         return 12 // (len(self.table.form.flags) * self.returns)
 
     @property
-    def columns_per_packet(self) -> int:
-        """Firing sequences of a packet."""
-        return self.rows_per_packet * self.table.form.columns_per_row
+    def files(self) -> LidarFiles:
+        """The HDL-64E has a calibration of each unit."""
+        if not self.table.row.needs_file:
+            return LidarFiles()
+        return LidarFiles("yaml", calibration_yaml(self.model).encode())
 
     def encode(self, counts: I64Array, levels: I64Array) -> list[Sent]:
         """Packets of these columns."""
