@@ -7,7 +7,6 @@ with an event, which becomes a ClockJump here.
 
 from __future__ import annotations
 
-import ctypes
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
@@ -124,30 +123,24 @@ class Intake:
         columns = len(column_offsets)
         self._watch = watch
         self._reader = reader
-        self._offsets = np.ascontiguousarray(column_offsets, np.int64)
         self._rejected = np.zeros(len(_REASONS), np.int64)
-        recent = np.zeros((DUPLICATE_REACH, 3), np.int64)
-        heads = np.zeros(_KEY_HEADS, np.int64)
-        held = np.empty((2, columns), np.int64)
-        held_valid = np.empty(columns, np.bool_)
-        self._kept = (recent, heads, held, held_valid)
         self._struct = native.Intake(
-            reader=None if reader is None else ctypes.addressof(reader.struct),
+            reader=None if reader is None else reader.struct,
             columns=columns,
-            offsets=native.address(self._offsets),
-            numbers=ctypes.addressof(self.loss.numbers.struct),
+            offsets=np.ascontiguousarray(column_offsets, np.int64),
+            numbers=self.loss.numbers.struct,
             offset_ns=offset_ns,
             by_host=host_clock,
             finds_jumps=finds_jumps,
             takes_all=takes_all,
             newest_ns=NEVER,
             delivered_ns=NEVER,
-            rejected=native.address(self._rejected),
-            recent=native.address(recent),
-            heads=native.address(heads),
-            held_stamp_ns=native.address(held[0]),
-            held_encoder=native.address(held[1]),
-            held_valid=native.address(held_valid),
+            rejected=self._rejected,
+            recent=np.zeros((DUPLICATE_REACH, 3), np.int64),
+            heads=np.zeros(_KEY_HEADS, np.int64),
+            held_stamp_ns=np.empty(columns, np.int64),
+            held_encoder=np.empty(columns, np.int64),
+            held_valid=np.empty(columns, np.bool_),
         )
 
     @property
@@ -189,21 +182,22 @@ class Intake:
         position, host_ns, newest_ns, lowest_ns, sensor_ns = np.empty((5, shape[0]), np.int64)
         stamp_ns, encoder, ring_index = (np.empty(shape, np.int64) for _ in range(3))
         valid = np.empty(shape, np.bool_)
-        out = native.Accepted()
-        out.position, out.host_ns, out.newest_ns, out.lowest_ns, out.sensor_ns = map(
-            native.address, (position, host_ns, newest_ns, lowest_ns, sensor_ns)
+        out = native.Accepted(
+            position=position,
+            host_ns=host_ns,
+            newest_ns=newest_ns,
+            lowest_ns=lowest_ns,
+            sensor_ns=sensor_ns,
+            stamp_ns=stamp_ns,
+            encoder=encoder,
+            ring_index=ring_index,
+            valid=valid,
         )
-        out.stamp_ns, out.encoder, out.ring_index, out.valid = map(
-            native.address, (stamp_ns, encoder, ring_index, valid)
-        )
-        struct, kept = self._given(arrival, owned)
+        given_packets = self._given(arrival, owned)
         if isinstance(arrival.content, Headers):
             given = arrival.content.columns
             stamp_ns[1:], encoder[1:], valid[1:] = given.stamp_ns, given.encoder, given.valid
-        event = native.library().mlbatch_take(
-            ctypes.byref(self._struct), ctypes.byref(struct), ctypes.byref(out)
-        )
-        del kept
+        event = native.library().mlbatch_take(self._struct, given_packets, out)
         own = slice(out.packets)
         accepted = Accepted(
             out.read,
@@ -222,10 +216,8 @@ class Intake:
         self._observe(accepted, sensor_ns[own])
         return accepted
 
-    def _given(
-        self, arrival: Arrival, owned: BoolArray
-    ) -> tuple[native.Arrival, list[npt.NDArray[Any]]]:
-        """The struct of packets, and its arrays to keep."""
+    def _given(self, arrival: Arrival, owned: BoolArray) -> native.Arrival:
+        """The struct of packets."""
         content = arrival.content
         arrays: dict[str, npt.NDArray[Any]] = {
             "position": arrival.position,
@@ -246,10 +238,8 @@ class Intake:
         kept = {name: np.ascontiguousarray(array) for name, array in arrays.items()}
         if kept["owned"] is not owned:
             raise ValueError("expected a C-contiguous array")
-        places = {name: native.address(array) for name, array in kept.items()}
         is_read = isinstance(content, Headers)
-        struct = native.Arrival(packets=len(arrival.position), is_read=is_read, **places)
-        return struct, list(kept.values())
+        return native.Arrival(packets=len(arrival.position), is_read=is_read, **kept)
 
     def _observe(self, accepted: Accepted, sensor_ns: I64Array) -> None:
         """Show accepted packets to the watch, and to what counts loss by gaps.

@@ -7,14 +7,13 @@ sends nothing because its rotor passes a dark sector.
 
 from __future__ import annotations
 
-import ctypes
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 
 from mlbatch.arrays import BoolArray, F64Array, I64Array, U16Array, U32Array, median
-from mlbatch.native.library import Numbers, address, library
+from mlbatch.native.library import Numbers, library
 from mlbatch.types import ColumnHeaders
 from mlbatch.units import NS_PER_S
 
@@ -70,7 +69,7 @@ class SequenceLoss:
     def add(self, sequence: I64Array) -> None:
         """Add accepted packets (n,) in order of receive time; negative numbers are ignored."""
         numbers = np.ascontiguousarray(sequence, np.int64)
-        library().mlbatch_numbers(ctypes.byref(self.struct), len(numbers), address(numbers))
+        library().mlbatch_numbers(self.struct, len(numbers), numbers)
 
 
 # -- by gaps in the stamps ------------------------------------------------------------------------

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from mlbatch.lidar.geometry import SECTORS
-from mlbatch.native.library import Part, address, library
+from mlbatch.native.library import Part, library
 from mlbatch.types import ColumnFigures, Columns, WindowColumns, WindowFigures
 
 _NONE = np.empty(0, np.int64)
@@ -47,23 +47,21 @@ class ColumnMerge:
     def _taken(self, waiting: Sequence[list[Columns]], until: int) -> WindowColumns | None:
         """Do `take_until`; return None and take nothing if a sensor's columns are not in order."""
         parts = [(sensor, one) for sensor, own in enumerate(waiting) for one in own]
-        structs = (Part * len(parts))()
-        kept = []
-        for struct, (sensor, columns) in zip(structs, parts, strict=True):
-            arrays = [
-                np.ascontiguousarray(array)
-                for array in (columns.stamp_ns, columns.ring_index, columns.encoder)
-            ]
-            struct.sensor = sensor
-            struct.columns = len(columns)
-            struct.stamp_ns, struct.ring_index, struct.encoder = map(address, arrays)
-            kept.append(arrays)
+        structs = [
+            Part(
+                sensor=sensor,
+                columns=len(columns),
+                stamp_ns=np.ascontiguousarray(columns.stamp_ns),
+                ring_index=np.ascontiguousarray(columns.ring_index),
+                encoder=np.ascontiguousarray(columns.encoder),
+            )
+            for sensor, columns in parts
+        ]
         taken = np.empty(len(parts), np.int64)
         # One array each, since readers may keep some of them.
         merged = [np.empty(sum(len(one) for _, one in parts), np.int64) for _ in range(4)]
-        count = self._library.mlbatch_merge(
-            len(parts), structs, until, address(taken), *map(address, merged)
-        )
+        in_a_row = (Part * len(parts))(*structs)
+        count = self._library.mlbatch_merge(len(parts), in_a_row, until, taken, *merged)
         if count < 0:
             return None
         for own in waiting:
@@ -78,20 +76,10 @@ class ColumnMerge:
         """Return the figures of each window; ends: column after the last of each."""
         sensors = len(self._positions)
         figures = np.empty((len(ends), sensors, _FIGURES), np.int64)
-        bounds = np.array(ends, np.int64)
-        columns = [
-            np.ascontiguousarray(array)
-            for array in (merged.stamp_ns, merged.sensor, merged.encoder)
-        ]
+        columns = map(np.ascontiguousarray, (merged.stamp_ns, merged.sensor, merged.encoder))
         self._library.mlbatch_figures(
-            len(ends),
-            address(bounds),
-            *map(address, columns),
-            sensors,
-            address(self._positions),
-            SECTORS,
-            address(self._entered),
-            address(figures),
+            *(len(ends), np.array(ends, np.int64), *columns, sensors),
+            *(self._positions, SECTORS, self._entered, figures),
         )
         return [
             [

@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import ctypes
 from collections.abc import Hashable, Sequence
-from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from mlbatch.arrays import F32Array, F64Array, I64Array
 from mlbatch.decode.groups import CORRECTED, MIRRORED, TURNING, SensorGroup, Source, group_key
@@ -73,15 +70,13 @@ class Engine:
         kinds = np.array([struct.kind for struct in self._structs])[self._group_of]
         self._turns = np.isin(kinds, (TURNING, CORRECTED))
         self._is_mirrored = kinds == MIRRORED
-        boxes = np.ascontiguousarray(boxes_m, np.float32)
-        self._arrays = (self._group_of, self._member_of, boxes)
         self._scan = Scan(
-            group_of=address(self._group_of),
-            member_of=address(self._member_of),
+            group_of=self._group_of,
+            member_of=self._member_of,
             group_count=len(by_key),
-            groups=ctypes.addressof(self._structs),
-            box_count=len(boxes),
-            boxes_m=address(boxes),
+            groups=self._structs,
+            box_count=len(boxes_m),
+            boxes_m=np.ascontiguousarray(boxes_m, np.float32),
             row_slots=organized_slots,
         )
         if record is not None:
@@ -108,18 +103,17 @@ class Engine:
         start_ns: start of the scan; first_number: number of the first column in the scan.
         """
         scan = self._scan
-        # The arrays are kept until the call returns: another thread may let a ring grow.
+        # The structs keep the arrays: another thread may let a ring grow.
         for group in self._groups:
             group.use_rings()
         self._use_outputs(out)
-        kept = self._use_columns(columns)
+        self._use_columns(columns)
         if self._packer is not None:
             self._packer.start(scan, start_ns, self._timescale)
         scan.start_ns = start_ns
         scan.first_number = first_number
         scan.first_row = 0
-        points = int(self._library.mlbatch_decode(ctypes.byref(scan)))
-        del kept
+        points = int(self._library.mlbatch_decode(scan))
         for group in self._groups:
             group.add_counts()
         return points
@@ -142,27 +136,19 @@ class Engine:
             has_reflectivity and "reflectivity" in self._extras,
         )
 
-    def _use_columns(self, columns: WindowColumns) -> list[npt.NDArray[Any]]:
-        """Point the struct to the columns; return the arrays to keep."""
-        kept: list[npt.NDArray[Any]] = [
-            np.ascontiguousarray(array, np.int64)
-            for array in (columns.stamp_ns, columns.sensor, columns.ring_index, columns.encoder)
-        ]
+    def _use_columns(self, columns: WindowColumns) -> None:
+        """Point the struct to the columns."""
         scan = self._scan
         scan.columns = len(columns)
-        scan.stamp_ns, scan.sensor, scan.ring_index, scan.encoder = map(address, kept)
-        scan.moves = None
-        if columns.moves is not None:
-            moves = np.ascontiguousarray(columns.moves, np.float32)
-            scan.moves = address(moves)
-            kept.append(moves)
+        for name in ("stamp_ns", "sensor", "ring_index", "encoder"):
+            setattr(scan, name, np.ascontiguousarray(getattr(columns, name), np.int64))
+        moves = columns.moves
+        scan.moves = None if moves is None else np.ascontiguousarray(moves, np.float32)
         if self._turns.any() or self._is_mirrored.any():
-            angles = self._angles(kept[1], kept[3])
+            angles = self._angles(columns.sensor, columns.encoder)
             for group in self._groups:
                 if group.struct.kind in (TURNING, CORRECTED, MIRRORED):
-                    group.struct.cosine, group.struct.sine = map(address, angles)
-            kept += angles
-        return kept
+                    group.struct.cosine, group.struct.sine = angles
 
     def _angles(self, sensor: I64Array, encoder: I64Array) -> list[F32Array]:
         """Return cosines and sines of all columns; undefined for sensors without rotor words."""
@@ -189,11 +175,11 @@ class Engine:
             return
         self._set_arrays(out, "range_m" in extras, "reflectivity" in extras)
         wants_column = "column" in extras and not out.is_organized
-        self._scan.column = address(out.column) if wants_column else None
+        self._scan.column = out.column if wants_column else None
 
     def _set_arrays(self, out: ScanBuffer, wants_range: bool, wants_reflectivity: bool) -> None:
         scan = self._scan
-        scan.point = address(out.point)
-        scan.label = address(out.label)
-        scan.range_m = address(out.range_m) if wants_range else None
-        scan.reflectivity = address(out.reflectivity) if wants_reflectivity else None
+        scan.point = out.point
+        scan.label = out.label
+        scan.range_m = out.range_m if wants_range else None
+        scan.reflectivity = out.reflectivity if wants_reflectivity else None

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import ctypes
 from collections.abc import Hashable, Sequence
 from dataclasses import dataclass
-from typing import Any, TypeAlias
+from typing import TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -23,7 +22,7 @@ from mlbatch.lidar.geometry import (
     PlacedPoints,
 )
 from mlbatch.lidar.interface import BitField, Lidar, PixelTable, ReturnLayout
-from mlbatch.native.library import Field, Group, Ring, address
+from mlbatch.native.library import Field, Group, Ring
 from mlbatch.reports.ledger import PointCounts
 
 # As in `native.h`.
@@ -89,18 +88,17 @@ class SensorGroup:
         self._slots = self._sources[0].slots
         self._rings = [source.ring for source in self._sources]
         self._width = _width(self._lidar)
-        self._arrays: list[Any] = []
         # Of the last call; None: before the first.
         self._pieces: list[npt.NDArray[np.void] | None] = [None] * len(members)
         self._ring_structs = (Ring * len(members))()
         self._counts = np.zeros((len(members), _COUNTS), np.int64)
         geometries = [geometry(source) for source in self._sources]
-        struct.rings = ctypes.addressof(self._ring_structs)
+        struct.rings = self._ring_structs
         struct.beams = self._lidar.channels
         struct.width = self._width
         struct.returns = self._lidar.returns
         struct.slots = self._slots
-        struct.counts = self._kept(self._counts)
+        struct.counts = self._counts
         self._order = _firing_order(self._lidar)
         table = self._lidar.pixels
         if table is not None:
@@ -111,7 +109,7 @@ class SensorGroup:
         self._set_labels(members)
         limits = [(source.min_range_m, source.max_range_m) for source in self._sources]
         if any(low > 0 or high < float("inf") for low, high in limits):
-            struct.limits_m = self._kept(np.array(limits, np.float32))
+            struct.limits_m = np.array(limits, np.float32)
 
     def mirror_angles(self, angle_rad: F64Array) -> F32Array:
         """Return cosine and sine (2, n) of twice the angle past the start of the mirror, (n,)."""
@@ -147,12 +145,6 @@ class SensorGroup:
             counts.box += in_range - outside
             counts.written += outside
 
-    def _kept(self, array: npt.NDArray[Any]) -> int:
-        """Return the address of an array that lives as long as the group."""
-        array = np.ascontiguousarray(array)
-        self._arrays.append(array)
-        return address(array)
-
     # -- pixels --
 
     def _set_pixels(self, table: PixelTable, has_reflectivity: bool) -> None:
@@ -162,19 +154,17 @@ class SensorGroup:
         ]
         layouts = [_fields(layout) for layout in table.returns]
         fields = [field for _, own in layouts for field in own]
-        structs = (Field * len(fields))(*(Field(*field) for field in fields))
-        self._arrays.append(structs)
         struct = self.struct
         struct.step = table.step
         struct.run_count = len(runs[0])
-        struct.runs = self._kept(np.array(runs, np.int64))
+        struct.runs = np.array(runs, np.int64)
         # Returns with fewer words read their first one again.
         most = max(len(words) for words, _ in layouts)
         words = [[*own, *own[:1] * (most - len(own))] for own, _ in layouts]
         struct.word_count = most
-        struct.word_bytes = self._kept(np.array(words, np.int64))
-        struct.fields = ctypes.addressof(structs)
-        struct.scale = self._kept(np.array([table.factor, table.divisor], np.float32))
+        struct.word_bytes = np.array(words, np.int64)
+        struct.fields = (Field * len(fields))(*(Field(*field) for field in fields))
+        struct.scale = np.array([table.factor, table.divisor], np.float32)
         struct.silent = table.silent
         is_dark = np.ones(self._lidar.channels, np.bool_)
         for run in table.returns[0].runs:
@@ -182,7 +172,7 @@ class SensorGroup:
         is_dark[list(table.dark)] = True
         dark = is_dark.nonzero()[0]
         struct.dark_count = len(dark)
-        struct.dark = self._kept(dark)
+        struct.dark = dark
         struct.has_reflectivity = (
             self._lidar.has_reflectivity
             and has_reflectivity
@@ -200,31 +190,31 @@ class SensorGroup:
             # Bytes of a slot, for prefetches.
             struct.step = self._lidar.records.size // self._slots
             runs = [first.first_byte, first.labels_at, self._slots]
-            struct.runs = self._kept(np.array(runs, np.int64))
-            struct.direction = self._kept(first.rotation)
-            struct.origin = self._kept(first.translation_m)
+            struct.runs = np.array(runs, np.int64)
+            struct.direction = np.ascontiguousarray(first.rotation)
+            struct.origin = np.ascontiguousarray(first.translation_m)
             if first.origin_m is not None:
-                struct.axis_m = self._kept(first.origin_m)
+                struct.axis_m = np.ascontiguousarray(first.origin_m)
             struct.tables = len(self._lidar.firing_ns)
         elif isinstance(first, Coordinates):
             struct.kind = COORDINATES
             struct.step = first.return_bytes
-            struct.runs = self._kept(np.array([first.intensity_at], np.int64))
+            struct.runs = np.array([first.intensity_at], np.int64)
             struct.coordinates = first.form
-            struct.pose_f8 = self._kept(first.pose)
-            struct.sines = self._kept(first.sines)
+            struct.pose_f8 = np.ascontiguousarray(first.pose)
+            struct.sines = np.ascontiguousarray(first.sines)
             struct.tables = len(self._lidar.firing_ns)
         elif isinstance(first, CorrectedRanges):
             self._set_rotor_planes(CORRECTED, first)
         elif isinstance(first, Mirrors):
             self._set_rotor_planes(MIRRORED, first)
             struct.steps = first.azimuth.shape[1]
-            struct.azimuth_value, struct.azimuth_slope = map(self._kept, first.azimuth)
-            struct.elevation_value, struct.elevation_slope = map(self._kept, first.elevation)
+            struct.azimuth_value, struct.azimuth_slope = np.ascontiguousarray(first.azimuth)
+            struct.elevation_value, struct.elevation_slope = np.ascontiguousarray(first.elevation)
         elif isinstance(first, OffAxis):
             self._set_rotors([first.beams])
-            struct.miss_m2 = self._kept(self._beams(first.miss_m2))
-            struct.axis_m = self._kept(first.axis_m)
+            struct.miss_m2 = self._beams(first.miss_m2)
+            struct.axis_m = np.ascontiguousarray(first.axis_m)
         elif first.angle_rad is None:
             self._set_rotors(tables)
         else:
@@ -233,10 +223,10 @@ class SensorGroup:
     def _set_rotor_planes(self, kind: int, own: CorrectedRanges | Mirrors) -> None:
         struct = self.struct
         struct.kind = kind
-        struct.planes = self._kept(self._beams(own.planes))
-        struct.pose = self._kept(own.pose)
+        struct.planes = self._beams(own.planes)
+        struct.pose = np.ascontiguousarray(own.pose)
         struct.tables = len(self._lidar.firing_ns)
-        struct.firing_ns = self._kept(self._beams(self._firing_ns()))
+        struct.firing_ns = self._beams(self._firing_ns())
 
     def _set_angle_table(self, tables: Sequence[BeamTable]) -> None:
         if any(table.origin.shape[1] != 1 for table in tables):
@@ -253,14 +243,14 @@ class SensorGroup:
         rows = [len(cosine) for cosine, _ in rotors]
         struct = self.struct
         struct.kind = TABLED
-        struct.direction = self._kept(self._beams(vectors))
-        struct.cosine = self._kept(np.concatenate([cosine for cosine, _ in rotors]))
-        struct.sine = self._kept(np.concatenate([sine for _, sine in rotors]))
-        struct.origin = self._kept(origin)
-        struct.first_row = self._kept(np.cumsum([0, *rows[:-1]]).astype(np.int64))
-        struct.used = self._kept(_used_by_table(vectors, origin))
+        struct.direction = self._beams(vectors)
+        struct.cosine = np.concatenate([cosine for cosine, _ in rotors])
+        struct.sine = np.concatenate([sine for _, sine in rotors])
+        struct.origin = origin
+        struct.first_row = np.cumsum([0, *rows[:-1]]).astype(np.int64)
+        struct.used = _used_by_table(vectors, origin)
         struct.rows = sum(rows)
-        struct.reach = self._kept(self._beams(reach_m))
+        struct.reach = self._beams(reach_m)
         struct.tables = 1
 
     def _set_rotors(self, tables: Sequence[BeamTable]) -> None:
@@ -273,16 +263,16 @@ class SensorGroup:
             _used_vectors(direction, origin, bool(one.origin[:2].any()))
             for direction, origin, one in zip(directions, origins, tables, strict=True)
         ]
-        struct.direction = self._kept(self._beams(np.stack(directions)))
-        struct.origin = self._kept(self._beams(np.stack(origins)))
-        struct.used = self._kept(np.array(used, np.int64))
+        struct.direction = self._beams(np.stack(directions))
+        struct.origin = self._beams(np.stack(origins))
+        struct.used = np.array(used, np.int64)
         struct.tables = len(self._lidar.firing_ns)
         if any(bool(one.reach_m.any()) for one in tables):
             reaches_m = [np.broadcast_to(one.reach_m, (channels,)) for one in tables]
-            struct.reach = self._kept(self._beams(np.stack(reaches_m).astype(np.float32)))
+            struct.reach = self._beams(np.stack(reaches_m).astype(np.float32))
         if self._firing_ns().any():
             firing_ns = np.concatenate([self._firing_ns(source) for source in self._sources])
-            struct.firing_ns = self._kept(self._beams(firing_ns))
+            struct.firing_ns = self._beams(firing_ns)
 
     def _firing_ns(self, source: Source | None = None) -> F32Array:
         """Return firing times (T, B), ns; beams that do not fire (-1) have no points."""
@@ -292,7 +282,7 @@ class SensorGroup:
     def _beams(self, values: F32Array) -> F32Array:
         """Return values by beam (the last axis), padded to planes."""
         missing = self._width - values.shape[-1]
-        return np.pad(values, [(0, 0)] * (values.ndim - 1) + [(0, missing)]) if missing else values
+        return np.ascontiguousarray(np.pad(values, [(0, 0)] * (values.ndim - 1) + [(0, missing)]))
 
     # -- slots and labels --
 
@@ -307,11 +297,11 @@ class SensorGroup:
             )
         number = np.zeros(lidar.returns * self._width, np.int64)
         number[element] = slot
-        struct.slot = None if np.array_equal(slot, element) else self._kept(number)
+        struct.slot = None if np.array_equal(slot, element) else number
         if self._order is not None:
-            struct.order = self._kept(element[self._order])
+            struct.order = element[self._order]
         elif lidar.returns > 1:
-            struct.order = self._kept(element)
+            struct.order = element
         has_orders = self._order is not None and len(self._order) > 1
         struct.order_step = self._slots if has_orders else 0
         struct.typed = self._typed_by
@@ -330,7 +320,7 @@ class SensorGroup:
             words &= ~_TYPE_BITS
         labels = np.zeros((len(words), self._lidar.returns * self._width), np.int64)
         labels[:, self._elements()] = words.view(np.int64)
-        self.struct.labels = self._kept(labels)
+        self.struct.labels = labels
 
     def _elements(self) -> I64Array:
         """Return the element of each slot: `return * width + beam`."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ctypes
 import math
 from typing import Any, NamedTuple
 
@@ -41,8 +40,8 @@ class RecordPacker:
         """Point a struct to the pieces and the totals."""
         scan.record_bytes = self.record.step
         scan.piece_count = len(self._pieces)
-        scan.pieces = ctypes.addressof(self._pieces)
-        scan.totals = ctypes.addressof(self._totals)
+        scan.pieces = self._pieces
+        scan.totals = self._totals
 
     def start(self, scan: native.Scan, start_ns: int, timescale: str) -> None:
         """Set the start of a scan, and begin its totals."""
@@ -83,7 +82,7 @@ class RecordPacker:
             places = (None if one is None else one.first + slot * one.step for one in arrays)
             rows = native.Rows(*places, slots)
             records = address(out) + slot * columns * self.record.step
-            library().mlbatch_pack(ctypes.byref(struct), ctypes.byref(rows), columns, records)
+            library().mlbatch_pack(struct, rows, columns, records)
 
 
 class _Items(NamedTuple):

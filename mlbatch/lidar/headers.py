@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from mlbatch.arrays import BoolArray, F64Array, I64Array, U8Array
-from mlbatch.native.library import Reader, address, library
+from mlbatch.native.library import Reader, Struct, library
 from mlbatch.types import ColumnHeaders
 
 _KEY_WORD = 8
@@ -227,16 +227,13 @@ class HeaderReader:
         self.columns = table.columns * (table.rows if isinstance(table, TimedRows) else 1)
         self.wrong_crc = wrong_crc
         self._size = table.packet_bytes
-        self._odd = hash_factors(table.packet_bytes // _KEY_WORD)
-        self._arrays: list[npt.NDArray[Any]] = []
-        self._layout = self._struct(table)
         self.struct = Reader(
             kind=_KINDS.index(type(table)),
-            layout=ctypes.addressof(self._layout),
+            layout=_struct_of(table),
             packet_bytes=table.packet_bytes,
             columns=self.columns,
             has_number=has_number,
-            odd=address(self._odd),
+            odd=hash_factors(table.packet_bytes // _KEY_WORD),
         )
 
     def read(
@@ -262,14 +259,9 @@ class HeaderReader:
         )
         columns = found.columns
         library().mlbatch_headers(
-            ctypes.byref(self.struct),
-            address(data),
-            count,
-            address(start),
-            address(host_ns),
-            None if keys is None else address(keys),
-            *map(address, (found.is_mine, found.faults, found.key)),
-            *map(address, (columns.stamp_ns, columns.encoder, columns.valid)),
+            *(self.struct, data, count, start, host_ns, keys),
+            *(found.is_mine, found.faults, found.key),
+            *(columns.stamp_ns, columns.encoder, columns.valid),
         )
         if self.wrong_crc is not None:
             packets = data[start[:, None] + np.arange(self._size)]
@@ -288,20 +280,16 @@ class HeaderReader:
         times_ns = np.zeros(len(rows), np.int64) if host_ns is None else host_ns
         return self.read(rows.reshape(-1), start, times_ns)
 
-    def _struct(self, table: HeaderTable) -> ctypes.Structure:
-        """Return the struct of a table; its arrays live as long as this object."""
-        values: list[Any] = []
-        for value in table:
-            if isinstance(value, np.ndarray):
-                array = np.ascontiguousarray(value)
-                self._arrays.append(array)
-                values.append(address(array))
-            else:
-                values.append(value)
-        members = {"_fields_": fields_of(type(table))}
-        struct = type(type(table).__name__, (ctypes.Structure,), members)
-        found: ctypes.Structure = struct(*values)
-        return found
+
+def _struct_of(table: HeaderTable) -> Struct:
+    """Return the struct of a table."""
+    values = {
+        name: np.ascontiguousarray(value) if isinstance(value, np.ndarray) else value
+        for name, value in table._asdict().items()
+    }
+    struct = type(type(table).__name__, (Struct,), {"_fields_": fields_of(type(table))})
+    found: Struct = struct(**values)
+    return found
 
 
 # `lidar.interface.FAULTS` has the same order.

@@ -6,10 +6,6 @@
 
 #include "native.h"
 
-#if defined(__SSE2__)
-#include <emmintrin.h>
-#endif
-
 enum { RECORD_BYTES = 16, IPV4_BYTES = 20, IPV6_BYTES = 40, UDP_BYTES = 8 };
 enum { IPV4_TYPE = 0x0800, IPV6_TYPE = 0x86DD, MPLS_TYPE = 0x8847, PPPOE_TYPE = 0x8864 };
 enum { MORE_FRAGMENTS = 0x2000, FRAGMENT_OFFSET = 0x1FFF, MOST_DATAGRAM_BYTES = 65535 };
@@ -23,39 +19,9 @@ enum { NO_ROOM, CUT, TOO_LONG };
 /* Headers of so many frames ahead are asked for: what was just read is in no near cache. */
 enum { FRAMES_AHEAD = 4, LINE = 64 };
 
-static int64_t low(const uint8_t *byte)
+static int64_t word_of(const uint8_t *byte, int64_t is_swapped)
 {
-    return byte[0] | byte[1] << 8 | byte[2] << 16 | (int64_t)byte[3] << 24;
-}
-
-static int64_t high(const uint8_t *byte)
-{
-    return (int64_t)byte[0] << 24 | byte[1] << 16 | byte[2] << 8 | byte[3];
-}
-
-static int64_t high2(const uint8_t *byte)
-{
-    return byte[0] << 8 | byte[1];
-}
-
-static uint64_t high8(const uint8_t *byte)
-{
-    return (uint64_t)high(byte) << 32 | (uint64_t)high(byte + 4);
-}
-
-static int64_t word(const uint8_t *byte, int64_t is_swapped)
-{
-    return is_swapped ? high(byte) : low(byte);
-}
-
-/* Ask for a line of 64 bytes. */
-static void prefetch(const uint8_t *at)
-{
-#if defined(__SSE2__)
-    _mm_prefetch((const char *)at, _MM_HINT_T0);
-#else
-    (void)at;
-#endif
+    return is_swapped ? big_endian_at(byte, 4) : number_at(byte, 4);
 }
 
 /* Frames of the records in data[begin:end]: first byte, captured and original length, receive
@@ -72,7 +38,7 @@ EXPORT int64_t mlbatch_walk(const uint8_t *data, int64_t begin, int64_t end, int
             break;
         }
         const uint8_t *record = data + place;
-        const int64_t size = word(record + 8, is_swapped);
+        const int64_t size = word_of(record + 8, is_swapped);
         if (size > most_bytes) {
             why = TOO_LONG;
             break;
@@ -84,12 +50,12 @@ EXPORT int64_t mlbatch_walk(const uint8_t *data, int64_t begin, int64_t end, int
         /* Most frames are as long as the one before. */
         const int64_t ahead = place + FRAMES_AHEAD * (RECORD_BYTES + size);
         if (ahead < end)
-            prefetch(data + ahead);
+            __builtin_prefetch(data + ahead);
         columns[count] = place + RECORD_BYTES;
         columns[room + count] = size;
-        columns[2 * room + count] = word(record + 12, is_swapped);
+        columns[2 * room + count] = word_of(record + 12, is_swapped);
         columns[3 * room + count] =
-            word(record, is_swapped) * INT64_C(1000000000) + word(record + 4, is_swapped) * unit_ns;
+            word_of(record, is_swapped) * NS_PER_S + word_of(record + 4, is_swapped) * unit_ns;
         place += RECORD_BYTES + size;
     }
     stop[0] = place;
@@ -132,7 +98,7 @@ static int read_udp(const uint8_t *data, int64_t at, int64_t stop, Packet *packe
     if (at + UDP_BYTES > stop)
         return TRUNCATED;
     packet->start = at;
-    packet->size = high2(data + at + 4);
+    packet->size = big_endian_at(data + at + 4, 2);
     return packet->size < UDP_BYTES || at + packet->size > stop ? TRUNCATED : WHOLE;
 }
 
@@ -149,7 +115,7 @@ static int read_ipv4(const uint8_t *data, int64_t at, int64_t stop, Packet *pack
     if (at + IPV4_BYTES > stop)
         return TRUNCATED;
     const uint8_t *header = data + at;
-    const int64_t body = at + (header[0] & 15) * 4, place = high2(header + 6);
+    const int64_t body = at + (header[0] & 15) * 4, place = big_endian_at(header + 6, 2);
     const int is_part = (place & (MORE_FRAGMENTS | FRAGMENT_OFFSET)) != 0;
     if (header[0] >> 4 != 4 || body < at + IPV4_BYTES)
         return NOT_IP;
@@ -159,14 +125,14 @@ static int read_ipv4(const uint8_t *data, int64_t at, int64_t stop, Packet *pack
         return NOT_UDP;
     packet->key[0] = UINT64_C(4) << 32;
     packet->key[1] = packet->key[3] = 0;
-    packet->key[2] = (uint64_t)high(header + 12);
-    packet->key[4] = (uint64_t)high(header + 16);
+    packet->key[2] = (uint64_t)big_endian_at(header + 12, 4);
+    packet->key[4] = (uint64_t)big_endian_at(header + 16, 4);
     if (!is_part)
         return read_udp(data, body, stop, packet);
-    packet->key[0] |= (uint64_t)high2(header + 4);
+    packet->key[0] |= (uint64_t)big_endian_at(header + 4, 2);
     packet->offset = (place & FRAGMENT_OFFSET) * 8;
     packet->more = (place & MORE_FRAGMENTS) != 0;
-    return read_part(body, at + high2(header + 2), stop, packet);
+    return read_part(body, at + big_endian_at(header + 2, 2), stop, packet);
 }
 
 static int read_ipv6(const uint8_t *data, int64_t at, int64_t stop, Packet *packet)
@@ -175,11 +141,11 @@ static int read_ipv6(const uint8_t *data, int64_t at, int64_t stop, Packet *pack
         return TRUNCATED;
     if (data[at] >> 4 != 6)
         return NOT_IP;
-    const int64_t end = at + IPV6_BYTES + high2(data + at + 4);
+    const int64_t end = at + IPV6_BYTES + big_endian_at(data + at + 4, 2);
     int kind = data[at + 6];
     packet->key[0] = UINT64_C(6) << 32;
     for (int word = 1; word < KEY_WORDS; word++)
-        packet->key[word] = high8(data + at + 8 * word);
+        packet->key[word] = (uint64_t)big_endian_at(data + at + 8 * word, 8);
     at += IPV6_BYTES;
     for (int headers = 0; headers < MOST_HEADERS; headers++) {
         if (kind == UDP)
@@ -187,9 +153,9 @@ static int read_ipv6(const uint8_t *data, int64_t at, int64_t stop, Packet *pack
         if (kind == FRAGMENT_HEADER) {
             if (at + 8 > stop)
                 return TRUNCATED;
-            const int64_t place = high2(data + at + 2);
+            const int64_t place = big_endian_at(data + at + 2, 2);
             kind = data[at];
-            packet->key[0] = UINT64_C(6) << 32 | (uint64_t)high(data + at + 4);
+            packet->key[0] = UINT64_C(6) << 32 | (uint64_t)big_endian_at(data + at + 4, 4);
             at += 8;
             /* A fragment that is the whole datagram (RFC 6946) is read like one. */
             if (!(place & ~6))
@@ -219,13 +185,13 @@ static int read_typed(const uint8_t *data, int64_t type_at, int64_t at, int64_t 
 {
     if (at > stop)
         return TRUNCATED;
-    int64_t type = high2(data + type_at);
+    int64_t type = big_endian_at(data + type_at, 2);
     for (int tags = 0; tags < MOST_TAGS; tags++) {
         if (type != 0x8100 && type != 0x88A8 && type != 0x9100)
             break;
         if (at + 4 > stop)
             return TRUNCATED;
-        type = high2(data + at + 2);
+        type = big_endian_at(data + at + 2, 2);
         at += 4;
     }
     if (type == IPV4_TYPE)
@@ -318,8 +284,8 @@ static void deliver(Dissection *all, const uint8_t *data, const uint64_t *key, i
 {
     int64_t *datagram = all->datagrams + all->datagram_count++;
     datagram[0] = at + UDP_BYTES;
-    datagram[all->room] = high2(data + at + 4) - UDP_BYTES;
-    datagram[2 * all->room] = stream_of(all, key, high2(data + at + 2));
+    datagram[all->room] = big_endian_at(data + at + 4, 2) - UDP_BYTES;
+    datagram[2 * all->room] = stream_of(all, key, big_endian_at(data + at + 2, 2));
     datagram[3 * all->room] = host_ns;
 }
 
@@ -401,7 +367,7 @@ static void complete(Dissection *all, uint8_t *data, int64_t number, int64_t hos
     /* From now on the parts are in order. */
     set->top = first;
     const int64_t length =
-        parts[first].size < UDP_BYTES ? 0 : high2(part_bytes(all, data, first) + 4);
+        parts[first].size < UDP_BYTES ? 0 : big_endian_at(part_bytes(all, data, first) + 4, 2);
     if (length < UDP_BYTES || length > set->total) {
         remove_set(all, number, FRAGMENT_LOST);
         return;
@@ -484,8 +450,8 @@ EXPORT int64_t mlbatch_dissect(Dissection *all, uint8_t *data, int64_t first, in
     for (int64_t frame = first; frame < frames; frame++) {
         if (frame + FRAMES_AHEAD < frames) {
             const uint8_t *ahead = data + start[frame + FRAMES_AHEAD];
-            prefetch(ahead);
-            prefetch(ahead + LINE - 1);
+            __builtin_prefetch(ahead);
+            __builtin_prefetch(ahead + LINE - 1);
         }
         const int64_t stop = start[frame] + captured[frame];
         Packet packet;
@@ -495,7 +461,7 @@ EXPORT int64_t mlbatch_dissect(Dissection *all, uint8_t *data, int64_t first, in
         /* The next frame is likely to be copied, too. */
         if (verdict == PART && frame + 1 < frames)
             for (int64_t line = 0; line < captured[frame + 1]; line += LINE)
-                prefetch(data + start[frame + 1] + line);
+                __builtin_prefetch(data + start[frame + 1] + line);
         if (verdict == WHOLE)
             deliver(all, data, packet.key, packet.start, host_ns[frame]);
         else if (verdict == PART)
@@ -568,7 +534,7 @@ EXPORT void mlbatch_sums(int64_t packets, const uint8_t *data, const int64_t *st
         uint64_t sum = 0;
         int64_t line = 0;
         for (; line + LINE <= bytes; line += LINE) {
-            prefetch(next + line);
+            __builtin_prefetch(next + line);
             sum += sum_words(from + line, LINE);
         }
         sum += sum_words(from + line, bytes - line);

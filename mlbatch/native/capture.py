@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from mlbatch.arrays import BoolArray, I64Array, U8Array, U64Array
-from mlbatch.native.library import address, library
+from mlbatch.native.library import library
 
 # Why a walk ended: no room for more frames, no whole record, a frame that is too long.
 NO_ROOM, CUT, TOO_LONG = range(3)
@@ -31,15 +31,7 @@ class CaptureLoops:
         columns = np.empty((4, _ROOM), np.int64)
         stop = np.empty(2, np.int64)
         count = self._library.mlbatch_walk(
-            address(data),
-            begin,
-            end,
-            is_swapped,
-            unit_ns,
-            most_bytes,
-            _ROOM,
-            address(columns),
-            address(stop),
+            data, begin, end, is_swapped, unit_ns, most_bytes, _ROOM, columns, stop
         )
         place, why = stop.tolist()
         return columns[:, :count], place, why
@@ -53,14 +45,7 @@ class CaptureLoops:
         start, size, at_byte = map(np.ascontiguousarray, (start, size, at_byte))
         if bool(_is_outside(source, start, size).any() | _is_outside(out, at_byte, size).any()):
             raise IndexError("runs outside of their arrays")
-        self._library.mlbatch_copy(
-            len(start),
-            address(source),
-            address(start),
-            address(size),
-            address(out),
-            address(at_byte),
-        )
+        self._library.mlbatch_copy(len(start), source, start, size, out, at_byte)
 
     def sums(self, data: U8Array, start: I64Array, size: int) -> U64Array:
         """Return the checksums (n,) of packets of a size: sums of their 64-bit words, modulo 2^64.
@@ -75,7 +60,7 @@ class CaptureLoops:
         start = np.ascontiguousarray(start)
         if int(start.min()) < 0 or int(start.max()) + size > len(data):
             raise IndexError("packets outside of their array")
-        self._library.mlbatch_sums(len(start), address(data), address(start), size, address(found))
+        self._library.mlbatch_sums(len(start), data, start, size, found)
         return found
 
 

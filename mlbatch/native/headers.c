@@ -7,16 +7,8 @@
 
 #include "native.h"
 
-#if defined(__SSE2__)
-#include <emmintrin.h>
-#define PREFETCH(from) _mm_prefetch((const char *)(from), _MM_HINT_T0)
-#else
-#define PREFETCH(from) ((void)(from))
-#endif
-
 enum { MOST_BLOCKS = 64 };
 enum { NS_PER_US = 1000 };
-#define NS_PER_S INT64_C(1000000000)
 #define S_PER_DAY INT64_C(86400)
 
 /* Numbers of some bytes of a packet. */
@@ -25,22 +17,6 @@ typedef struct {
     int64_t bytes;
     int64_t value;
 } Check;
-
-static inline int64_t number_at(const uint8_t *from, int64_t bytes)
-{
-    uint64_t value = 0;
-    for (int64_t byte = 0; byte < bytes; byte++)
-        value |= (uint64_t)from[byte] << 8 * byte;
-    return (int64_t)value;
-}
-
-static inline int64_t big_endian_at(const uint8_t *from, int64_t bytes)
-{
-    uint64_t value = 0;
-    for (int64_t byte = 0; byte < bytes; byte++)
-        value = value << 8 | from[byte];
-    return (int64_t)value;
-}
 
 static inline int64_t short_at(const uint8_t *from)
 {
@@ -586,7 +562,7 @@ void mlbatch_read_header(const Reader *reader, const uint8_t *packet, const uint
         if (reader->kind == STAMPED)
             later += ((const StampedColumns *)layout)->first_column;
         for (int64_t column = 0; column < reader->columns; column++)
-            PREFETCH(later + column * step);
+            __builtin_prefetch(later + column * step);
     }
     header->is_mine = 1;
     header->fault = GOOD;

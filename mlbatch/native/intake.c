@@ -5,7 +5,6 @@
    so that the result does not depend on how packets are grouped. */
 #include "native.h"
 
-#define NS_PER_S INT64_C(1000000000)
 #define NEVER (-(INT64_C(1) << 62))
 #define FOREVER (INT64_C(1) << 62)
 /* A packet whose stamps differ more than this from the newest one needs confirmation. */

@@ -9,6 +9,7 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any, ClassVar
 
+import numpy as np
 import numpy.typing as npt
 
 from mlbatch.native import library_path
@@ -39,85 +40,118 @@ def members(struct: str) -> list[tuple[str, Any]]:
     ]
 
 
-class Ring(ctypes.Structure):
+class Struct(ctypes.Structure):
+    """A struct of the header: pointers take arrays and structs, which live as long as it."""
+
+    def __init__(self, *values: int | None, **named: Any) -> None:
+        super().__init__(*values)
+        for name, value in named.items():
+            setattr(self, name, value)
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        """Point to an array or a struct, and keep it; or set a number."""
+        place = value
+        if isinstance(value, np.ndarray):
+            place = address(value)
+        elif isinstance(value, ctypes.Structure | ctypes.Array):
+            place = ctypes.addressof(value)
+        if place is not value:
+            vars(self).setdefault("kept", {})[name] = value
+        super().__setattr__(name, place)
+
+
+class _Pointer:
+    """A pointer in the arguments of a function: an array, a struct, an address or None."""
+
+    @staticmethod
+    def from_param(value: Any) -> Any:
+        """Return what ctypes passes."""
+        if isinstance(value, np.ndarray):
+            return _ADDRESS.from_param(address(value))
+        if isinstance(value, ctypes.Structure):
+            return ctypes.byref(value)
+        return _ADDRESS.from_param(value)
+
+
+class Ring(Struct):
     """Where the columns of a sensor are."""
 
     _fields_: ClassVar = members("Ring")
 
 
-class Field(ctypes.Structure):
+class Field(Struct):
     """An integer in a word of a pixel."""
 
     _fields_: ClassVar = members("Field")
 
 
-class Group(ctypes.Structure):
+class Group(Struct):
     """Sensors that are decoded alike."""
 
     _fields_: ClassVar = members("Group")
 
 
-class Piece(ctypes.Structure):
+class Piece(Struct):
     """A piece of a packed record."""
 
     _fields_: ClassVar = members("Piece")
 
 
-class Scan(ctypes.Structure):
+class Scan(Struct):
     """A scan under construction."""
 
     _fields_: ClassVar = members("Scan")
 
 
-class Totals(ctypes.Structure):
+class Totals(Struct):
     """Totals of all points in a LAS header."""
 
     _fields_: ClassVar = members("Totals")
 
 
-class Rows(ctypes.Structure):
+class Rows(Struct):
     """Values of points to be packed."""
 
     _fields_: ClassVar = members("Rows")
 
 
-class Part(ctypes.Structure):
+class Part(Struct):
     """Columns of a sensor that wait for their window."""
 
     _fields_: ClassVar = members("Part")
 
 
-class Reader(ctypes.Structure):
+class Reader(Struct):
     """How the headers of a sensor's packets are read."""
 
     _fields_: ClassVar = members("Reader")
 
 
-class Numbers(ctypes.Structure):
+class Numbers(Struct):
     """Sequence numbers of the packets of a sensor."""
 
     _fields_: ClassVar = members("Numbers")
 
 
-class Intake(ctypes.Structure):
+class Intake(Struct):
     """The intake of a sensor, from batch to batch."""
 
     _fields_: ClassVar = members("Intake")
 
 
-class Arrival(ctypes.Structure):
+class Arrival(Struct):
     """Packets of a sensor in a batch."""
 
     _fields_: ClassVar = members("Arrival")
 
 
-class Accepted(ctypes.Structure):
+class Accepted(Struct):
     """Accepted packets of a sensor in a batch."""
 
     _fields_: ClassVar = members("Accepted")
 
 
-class Dissection(ctypes.Structure):
+class Dissection(Struct):
     """State of reading a capture, kept from frame to frame."""
 
     _fields_: ClassVar = members("Dissection")
@@ -146,7 +180,7 @@ def library() -> Any:
         function = getattr(loaded, name)
         function.restype = None if result == "void" else _WORD
         if arguments != "void":
-            function.argtypes = [_ADDRESS if "*" in one else _WORD for one in arguments.split(",")]
+            function.argtypes = [_Pointer if "*" in one else _WORD for one in arguments.split(",")]
     if loaded.mlbatch_abi() != _ABI:
         raise OSError(f"{path.name} of another version")
     return loaded

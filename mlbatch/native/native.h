@@ -328,6 +328,25 @@ typedef struct {
     int64_t *settled;     /* of inherited sets: a reason, -1: open */
 } Dissection;
 
+#define NS_PER_S INT64_C(1000000000)
+
+/* Numbers of a few bytes, little-endian, and the other way. */
+static inline int64_t number_at(const uint8_t *from, int64_t bytes)
+{
+    uint64_t value = 0;
+    for (int64_t byte = 0; byte < bytes; byte++)
+        value |= (uint64_t)from[byte] << 8 * byte;
+    return (int64_t)value;
+}
+
+static inline int64_t big_endian_at(const uint8_t *from, int64_t bytes)
+{
+    uint64_t value = 0;
+    for (int64_t byte = 0; byte < bytes; byte++)
+        value = value << 8 | from[byte];
+    return (int64_t)value;
+}
+
 static inline int64_t floor_divide(int64_t value, int64_t divisor)
 {
     return value / divisor - (value % divisor < 0);

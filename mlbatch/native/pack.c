@@ -6,8 +6,6 @@
 
 #include "native.h"
 
-#define NS_PER_S 1000000000
-
 /* The time of a label, ns after the start of the scan. */
 static inline uint32_t time_of(int64_t label)
 {

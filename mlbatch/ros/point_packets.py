@@ -11,14 +11,14 @@ type (8).
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
 from mlbatch.arrays import BoolArray, F32Array, I64Array, U8Array, U16Array
 from mlbatch.errors import RecordingError
-from mlbatch.native.library import address, library
+from mlbatch.native.library import library
 
 MAGIC = int.from_bytes(b"MLPC", "little")
 VERSION = 1
@@ -155,27 +155,13 @@ def pack(points: Points, layout: Layout, message_bytes: int) -> U8Array:
     reals = points.reals
     if reals.strides[1] != reals.itemsize:
         reals = np.ascontiguousarray(reals)
-    stamp_ns = np.ascontiguousarray(points.stamp_ns)
     ring = None if points.ring is None else np.ascontiguousarray(points.ring)
-    return_type = np.ascontiguousarray(points.return_type)
-    tag = np.ascontiguousarray(points.tag)
-    used = np.zeros(columns, np.uint16)
     library().mlbatch_cloud_pack(
-        len(points),
-        _address(placed.order),
-        address(placed.column),
-        address(placed.slot),
-        address(stamp_ns),
-        reals.strides[0] // reals.itemsize,
-        reals.__array_interface__["data"][0],
-        _address(ring),
-        address(return_type),
-        address(tag),
-        layout.slots,
-        layout.size,
-        columns,
-        address(used),
-        address(packets),
+        *(len(points), placed.order, placed.column, placed.slot),
+        *(np.ascontiguousarray(points.stamp_ns), reals.strides[0] // reals.itemsize),
+        *(reals.__array_interface__["data"][0], ring),
+        *map(np.ascontiguousarray, (points.return_type, points.tag)),
+        *(layout.slots, layout.size, columns, np.zeros(columns, np.uint16), packets),
     )
     if points.label is not None:
         labels = packets[:, layout.labels_at :].view(np.int64)
@@ -212,14 +198,7 @@ def _placed(points: Points, layout: Layout) -> _Placed:
     column = np.empty(count, np.int32)
     slot: U16Array = np.empty(count, np.uint16)
     columns = library().mlbatch_cloud_columns(
-        count,
-        address(stamp_ns),
-        _address(ring),
-        _address(order),
-        layout.slots,
-        layout.by_ring,
-        address(column),
-        address(slot),
+        count, stamp_ns, ring, order, layout.slots, layout.by_ring, column, slot
     )
     return _Placed(columns, column, slot, order)
 
@@ -246,7 +225,3 @@ def _order(stamp_ns: I64Array, ring: U16Array | None) -> I64Array | None:
     words = words << np.uint64(number_bits) | np.arange(len(words), dtype=np.uint64)
     words.sort()
     return np.asarray(words & np.uint64((1 << number_bits) - 1), np.int64)
-
-
-def _address(array: npt.NDArray[Any] | None) -> int | None:
-    return None if array is None else address(array)

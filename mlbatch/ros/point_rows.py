@@ -61,17 +61,8 @@ def take_rows(rows: Rows) -> TakenRows:
     kept = library().mlbatch_cloud_points(
         count,
         rows.__array_interface__["data"][0],
-        rows.strides[0],
-        address(real_at),
-        address(real_type),
-        FIELD_NUMBERS[known["time"][0].str[1:]],
-        len(roles),
-        address(field_at),
-        address(field_bytes),
-        count,
-        address(reals),
-        targets,
-        address(placed),
+        *(rows.strides[0], real_at, real_type, FIELD_NUMBERS[known["time"][0].str[1:]]),
+        *(len(roles), field_at, field_bytes, count, reals, targets, placed),
     )
     return TakenRows(
         reals[:, :kept], {role: field[:kept] for role, field in fields.items()}, int(placed[0])
@@ -122,7 +113,7 @@ class PackedRows(NamedTuple):
 
 
 class _Form:
-    """Fields of rows of one dtype, for the loops; the arrays at `fields_at` and `types_at`.
+    """Fields of rows of one dtype, for the loops.
 
     is_usual: whether the loops read them; the others are only set if they do.
     """
@@ -134,8 +125,7 @@ class _Form:
         if not self.is_usual:
             return
         fields = np.array([field_of(known, role) for role in _ROLES], np.int64)
-        self._arrays = fields.T.copy()
-        self.fields_at, self.types_at = map(address, self._arrays)
+        self.fields_at, self.types = fields.T.copy()
         self.time_at, self.time_type = field_of(known, "time")
         self.time_kind = known["time"][0]
 
@@ -154,9 +144,6 @@ class RowPacker:
             np.empty(_MOST_RUNS + 1, np.int64),
             np.empty(3, np.int64),
         )
-        self._scratch_at = [address(one) for one in self._scratch]
-        self._times_at = address(self._times)
-        self._number_at = 0
         self._form = _Form(np.dtype([]))
 
     def pack(
@@ -182,21 +169,11 @@ class RowPacker:
         loops = library()
         if len(rows) > len(self._number):
             self._number = np.empty(len(rows), np.int32)
-            self._number_at = address(self._number)
         # Not by `__array_interface__`, which describes all fields.
         rows_at = rows.ctypes.data
-        axes_at = form.fields_at
         columns = loops.mlbatch_cloud_times(
-            len(rows),
-            rows_at,
-            rows.strides[0],
-            axes_at,
-            form.time_at,
-            form.time_type,
-            _MOST_TIMES,
-            self._times_at,
-            self._number_at,
-            *self._scratch_at,
+            *(len(rows), rows_at, rows.strides[0], form.fields_at, form.time_at, form.time_type),
+            *(_MOST_TIMES, self._times, self._number, *self._scratch),
         )
         placed, points, runs = self._scratch[-1].tolist()
         # One time for all points is an error elsewhere.
@@ -209,25 +186,11 @@ class RowPacker:
         check_columns(columns, points, layout, message_bytes)
         packets = room(columns, layout.size)
         content_key = np.empty(columns, np.int64)
-        head = _head_of(layout)
-        _, _, ranks_at, begins_at, _ = self._scratch_at
+        _, _, ranks, begins, _ = self._scratch
         is_packed = loops.mlbatch_cloud_fill(
-            rows_at,
-            rows.strides[0],
-            axes_at,
-            form.types_at,
-            runs,
-            begins_at,
-            self._number_at,
-            ranks_at,
-            columns,
-            address(stamp_ns),
-            address(head),
-            layout.slots,
-            layout.size,
-            None if factors is None else address(factors),
-            address(packets),
-            address(content_key),
+            *(rows_at, rows.strides[0], form.fields_at, form.types, runs, begins),
+            *(self._number, ranks, columns, stamp_ns, _head_of(layout)),
+            *(layout.slots, layout.size, factors, packets, content_key),
         )
         if not is_packed:
             return None

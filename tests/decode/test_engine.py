@@ -277,7 +277,8 @@ def test_all_builds_give_the_same_bytes(
     sources = [str(one) for one in sorted((PACKAGE / "native").glob("*.c"))]
     subprocess.run([*words, *flags, *sources], check=True)
     other = ctypes.CDLL(str(path))
-    other.mlbatch_decode.restype = ctypes.c_int64
+    ours_of = library().mlbatch_decode
+    other.mlbatch_decode.restype, other.mlbatch_decode.argtypes = ours_of.restype, ours_of.argtypes
     lidars = [*others, level_sensor("RNG15_RFL8_NIR8"), ouster("RNG19_RFL8_SIG16_NIR16_DUAL", 16)]
     for seed, extras in enumerate((frozenset[str](), EXTRAS, EXTRAS)):
         case = Case(seed, 700, layout, extras, is_cut=seed == 1, keeps_repeated=seed == 2)

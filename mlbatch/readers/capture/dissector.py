@@ -21,7 +21,6 @@ that overlap in time do not follow each other: their fragments never mix.
 
 from __future__ import annotations
 
-import ctypes
 import ipaddress
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -30,7 +29,7 @@ from typing import NamedTuple, TypeAlias
 import numpy as np
 
 from mlbatch.arrays import I64Array, U8Array
-from mlbatch.native.library import Dissection, address, library
+from mlbatch.native.library import Dissection, library
 from mlbatch.readers.capture.frames import RAW_IP, Frames
 from mlbatch.types import MOST_STREAMS, OTHER_STREAMS, CaptureCounts, Stream, StreamTable
 from mlbatch.units import NS_PER_S
@@ -105,7 +104,6 @@ class Dissector:
         self._stream_numbers: I64Array = np.zeros(0, np.int64)
         self._skipped = np.zeros(len(_REASONS), np.int64)
         self._addresses = np.empty((MOST_STREAMS, 3), np.uint64)
-        self._slots = np.zeros(2 * MOST_STREAMS, np.int64)
         self._sets = np.empty(MAX_SETS, _SET)
         self._parts = np.empty(0, _PART)
         self._kept: U8Array = np.empty(0, np.uint8)
@@ -113,17 +111,17 @@ class Dissector:
         self._first_keys = np.empty((MAX_FIRST_KEYS, _KEY_WORDS), np.uint64)
         self._settled = np.empty(0, np.int64)
         self._state = Dissection(
-            skipped=address(self._skipped),
+            skipped=self._skipped,
             most_streams=MOST_STREAMS,
-            slot_count=len(self._slots),
-            streams=address(self._addresses),
-            stream_slots=address(self._slots),
+            slot_count=2 * MOST_STREAMS,
+            streams=self._addresses,
+            stream_slots=np.zeros(2 * MOST_STREAMS, np.int64),
             most_age_ns=max_age_ns,
             most_sets=MAX_SETS,
-            sets=address(self._sets),
+            sets=self._sets,
             free_part=-1,
             most_first=MAX_FIRST_KEYS,
-            first_keys=address(self._first_keys),
+            first_keys=self._first_keys,
         )
 
     @property
@@ -162,14 +160,12 @@ class Dissector:
         self._room_for_parts(state.part_count + count)
         found = np.empty((4, count), np.int64)
         state.room = count
-        state.datagrams = address(found)
+        state.datagrams = found
         state.datagram_count = state.front = 0
         frame = depth = 0
         opened = -1
         while True:
-            frame = self._library.mlbatch_dissect(
-                ctypes.addressof(state), address(data), frame, count, *map(address, columns)
-            )
+            frame = self._library.mlbatch_dissect(state, data, frame, count, *columns)
             if frame == count:
                 break
             # A packet in a packet is odd again.
@@ -208,9 +204,9 @@ class Dissector:
         self._parts = np.array(parts, _PART)
         self._kept = np.frombuffer(store, np.uint8)
         self._kept_bytes = self._state.held_bytes = len(store)
-        self._state.kept = address(self._kept)
-        self._state.settled = address(self._settled)
-        self._state.parts = address(self._parts)
+        self._state.kept = self._kept
+        self._state.settled = self._settled
+        self._state.parts = self._parts
         self._state.part_count = len(parts)
         self._state.set_count = self._state.first_count = len(by_age)
         self._state.now_ns = now_ns
@@ -268,7 +264,7 @@ class Dissector:
     def _room_for_parts(self, count: int) -> None:
         if count > len(self._parts):
             self._parts = np.concatenate([self._parts, np.empty(count, _PART)])
-            self._state.parts = address(self._parts)
+            self._state.parts = self._parts
 
     def _keep(self, data: U8Array) -> None:
         """Copy what open sets have in `data`, whose bytes will be replaced."""
@@ -279,7 +275,7 @@ class Dissector:
             kept = np.empty(2 * state.held_bytes, np.uint8)
             self._kept_bytes = 0
         self._kept_bytes = self._library.mlbatch_keep(
-            ctypes.addressof(state), address(data), needs_room, address(kept), self._kept_bytes
+            state, data, needs_room, kept, self._kept_bytes
         )
         self._kept = kept
 
