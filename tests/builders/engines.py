@@ -32,7 +32,7 @@ WANTED = (
     Job((), extras=frozenset(), layout="organized"),
 )
 # Columns of a window that are compared: the literal decoder takes 2 ms for one of 128 beams.
-MOST_COLUMNS = 12
+MOST_COLUMNS = 4
 
 
 class Pair:
