@@ -45,38 +45,6 @@ def _one_line(shell: Shell, command: str, code: int, message: str) -> None:
 
 # -- devices and pipes ------------------------------------------------------------------------
 
-# Commands that read a text or an archive; {}: its path.
-READ = {
-    "rig": (f"convert {CAPTURE} --dry-run -r {{}}", "readable file"),
-    "metadata": (f"convert {PAIR} --dry-run -m {{}}", "calibration file"),
-    "golden": ("digest out --against {}", "golden file"),
-    "report": ("report {}", "readable file"),
-    "report of an output": ("report out --report {}", "readable file"),
-    "verified": ("verify {}", "output of `mlbatch convert`"),
-    "digested": ("digest {}", "output of `mlbatch convert`"),
-    "manifest": ("batch {}.yaml -o sessions", "readable file"),
-    "scenario": ("simulate {}.yaml -o x.pcap", "scenario file"),
-}
-
-
-@pytest.mark.parametrize("name", READ)
-@pytest.mark.parametrize("kind", ["pipe", "device"])
-def test_no_command_reads_a_device_or_a_pipe(
-    shell: Shell, output: str, name: str, kind: str
-) -> None:
-    words, expected = READ[name]
-    for suffix in ("", ".yaml"):
-        if kind == "pipe":
-            os.mkfifo(f"pipe{suffix}")
-        else:
-            Path(f"device{suffix}").symlink_to("/dev/zero")
-    outcome = shell(words.format(kind))
-    assert outcome.code == 1
-    (line,) = outcome.err.splitlines()
-    assert f": expected a{'n' * (expected[0] == 'o')} {expected}" in line
-    assert f"found a {kind}" in line.replace("'", "") or name == "scenario"
-    assert Path(output).is_dir()
-
 
 def test_a_pipe_among_the_scans_is_damage(shell: Shell, output: str) -> None:
     first = Path(output) / "000000.npz"

@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 import math
+import shutil
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
-from typing import Any, cast
 
 import numpy as np
 import pytest
-from mcap.reader import make_reader
-from mcap.writer import Writer
 
 from mlbatch.arrays import F64Array
+from tests.builders.rewritten_outputs import Sent, mcap
 from tests.builders.sessions import Shell, arrays, names, report_of
 from tests.builders.simulated import Recorded, read_tum, record, scenario_text
 from tests.motion.test_constant_velocity import BOXES
@@ -47,38 +47,24 @@ def changed(drive: Recorded, change: Change) -> str:
     """A copy; change: takes the time of a sample (ns since the start) and its 37 values, changes
     these, and returns by how much to change its stamp (ns), or None to leave it out.
     """
-    with drive.path.open("rb") as source, Path("drive.mcap").open("wb") as target:
-        reader, writer = make_reader(source), Writer(target)
-        writer.start("ros2")
-        schemas: dict[int, int] = {}
-        channels: dict[int, int] = {}
-        first_ns: int | None = None
-        for schema, channel, message in reader.iter_messages(log_time_order=False):
-            if schema is not None and schema.id not in schemas:
-                schemas[schema.id] = writer.register_schema(
-                    schema.name, schema.encoding, schema.data
-                )
-            if channel.id not in channels:
-                channels[channel.id] = writer.register_channel(
-                    channel.topic,
-                    channel.message_encoding,
-                    schemas[schema.id] if schema is not None else 0,
-                    channel.metadata,
-                )
-            data: bytes = message.data
-            if channel.topic == "/imu/data":
-                words = np.frombuffer(data, "<u4", 2, 4)
-                stamp_ns = int(words[0]) * S + int(words[1])
-                first_ns = stamp_ns if first_ns is None else first_ns
-                values = np.frombuffer(data[-TAIL:], "<f8").copy()
-                shift_ns = change(stamp_ns - first_ns, values)
-                if shift_ns is None:
-                    continue
-                stamp_ns += shift_ns
-                head = np.array([stamp_ns // S, stamp_ns % S], "<u4").tobytes()
-                data = data[:4] + head + data[12:-TAIL] + values.astype("<f8").tobytes()
-            writer.add_message(channels[channel.id], message.log_time, data, message.publish_time)
-        cast(Any, writer).finish()
+    shutil.copy(drive.path, "drive.mcap")
+    first_ns: list[int] = []
+
+    def of_sample(sent: Sent) -> list[Sent]:
+        if sent.topic != "/imu/data":
+            return [sent]
+        words = np.frombuffer(sent.data, "<u4", 2, 4)
+        stamp_ns = int(words[0]) * S + int(words[1])
+        first_ns.append(stamp_ns)
+        values = np.frombuffer(sent.data[-TAIL:], "<f8").copy()
+        shift_ns = change(stamp_ns - first_ns[0], values)
+        if shift_ns is None:
+            return []
+        head = np.array(divmod(stamp_ns + shift_ns, S), "<u4").tobytes()
+        data = sent.data[:4] + head + sent.data[12:-TAIL] + values.astype("<f8").tobytes()
+        return [replace(sent, data=data)]
+
+    mcap(of_sample)(Path("drive.mcap"))
     return f"convert drive.mcap --rig {drive.rig}"
 
 
