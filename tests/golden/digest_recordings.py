@@ -44,9 +44,7 @@ RECORDINGS: Mapping[str, Sequence[str]] = {
     "bag_db3": ("db3",),
     "bag_ros1": ("bag",),
 }
-# Those that meet every format, layout and container.
-PAIRED = tuple(name for name in RECORDINGS if not name.startswith("bag_"))
-_WITH_RIG = PAIRED[: PAIRED.index("livox")]
+_WITH_RIG = tuple(name for name, containers in RECORDINGS.items() if containers == CONTAINERS)
 
 NS_PER_MS = 1_000_000
 # Half a second before a full hour in 2026.

@@ -11,6 +11,7 @@ from __future__ import annotations
 import contextlib
 import json
 import os
+import shlex
 import shutil
 import subprocess
 import sys
@@ -44,7 +45,7 @@ class Run:
     """
 
     container: str = ""
-    jobs: int = 1
+    jobs: str = "1"
     interrupt: str = ""
 
 
@@ -63,151 +64,18 @@ class Case:
         return "out" + _SUFFIX.get(self.format, "")
 
 
-# A cover of all pairs of values, as far as they go together.
-# recording, format, layout, compression, container, jobs
-ROWS = """
-two_lidars mcap organized zstd bag 3
-two_lidars npz dense none pcapng 3
-two_lidars ply dense none mcap 1
-two_lidars rosbag1 dense none pcap 1
-two_lidars rosbag2 organized zstd db3 1
-four_makers mcap dense zstd mcap 1
-four_makers npz dense none pcap 3
-four_makers ply dense none db3 3
-four_makers rosbag1 organized none bag 1
-four_makers rosbag2 organized none pcapng 3
-ouster mcap dense zstd pcapng 1
-ouster npz dense none bag 1
-ouster ply dense none pcap 3
-ouster rosbag1 organized none db3 3
-ouster rosbag2 organized zstd mcap 3
-velodyne mcap organized zstd db3 1
-velodyne npz organized none mcap 1
-velodyne ply dense none bag 3
-velodyne rosbag1 dense none pcapng 3
-velodyne rosbag2 dense none pcap 3
-hesai mcap organized none pcap 3
-hesai npz organized none bag 3
-hesai ply dense none pcapng 3
-hesai rosbag1 organized none mcap 3
-hesai rosbag2 dense zstd db3 1
-robosense mcap organized zstd pcap 3
-robosense npz dense none db3 3
-robosense ply dense none bag 1
-robosense rosbag1 dense none pcapng 1
-robosense rosbag2 organized zstd mcap 1
-livox mcap organized zstd pcapng 1
-livox npz dense none pcapng 3
-livox ply dense none pcapng 1
-livox rosbag1 organized none pcap 3
-livox rosbag2 organized zstd pcap 1
-clouds mcap dense none db3 3
-clouds npz organized none mcap 1
-clouds ply dense none bag 1
-clouds rosbag1 organized none db3 1
-clouds rosbag2 dense zstd bag 3
-"""
-_PASSED = ("--pass", "/*/ouster/metadata")
-_THREE = Run(jobs=3)
+def _cases() -> Iterator[tuple[str, Case]]:
+    """Lines of `cases.txt`."""
+    for line in (_HERE / "cases.txt").read_text("utf-8").splitlines():
+        if not line.startswith("#"):
+            name, _, text = line.partition(": ")
+            first, *runs = text.split("; ")
+            recording, format_, *options = shlex.split(first)
+            every = tuple(Run(**dict(word.split("=") for word in run.split())) for run in runs)
+            yield name, Case(recording, tuple(options), format_, every)
 
 
-def _row_cases() -> dict[str, Case]:
-    cases = {}
-    for row in ROWS.split("\n")[1:-1]:
-        recording, format_, layout, compression, container, jobs = row.split()
-        options = ("--layout", layout, "--compression", compression)
-        name = f"{recording} {format_} {layout} {compression}"
-        cases[name] = Case(recording, options, format_, (Run(container, int(jobs)),))
-    return cases
-
-
-def _case(recording: str, *options: str, format: str = "npz", runs: tuple[Run, ...] = ()) -> Case:
-    return Case(recording, options, format, runs)
-
-
-def _option_cases() -> dict[str, Case]:
-    two = "two_lidars"
-    four = "four_makers"
-    cases = {
-        "split": _case(two, "--split", runs=(_THREE, Run("db3"))),
-        "split mcap": _case(four, "--split", format="mcap", runs=(_THREE, Run("mcap"))),
-        "slices": _case(two, "--slices", "4", format="mcap", runs=(_THREE, Run("bag"))),
-        "slices npz": _case(four, "--slices", "4", runs=(_THREE,)),
-        "split slices rosbag2": _case(two, "--split", "--slices", "4", format="rosbag2"),
-        "keep partial": _case(two, "--keep-partial", runs=(_THREE, Run("mcap"))),
-        "keep partial ply": _case(four, "--keep-partial", format="ply"),
-        "drop incomplete": _case(
-            two, "--keep-partial", "--drop-incomplete", "90", "--fault", "stall:left:0.3s-0.5s"
-        ),
-        "align clocks": _case(two, "--align-clocks", runs=(Run("pcapng"),)),
-        "align clocks to first": _case(
-            two, "--align-clocks", "--align-to", "first", "--fault", "drift:right:80ppm"
-        ),
-        "clock host": _case(four, "--clock", "host", format="mcap"),
-        "rate": _case(two, "--rate", "30/7", "--keep-partial"),
-        "wait for ever": _case(four, "--max-wait", "inf", "--rate", "29.97", format="mcap"),
-        "start end": _case(two, "--start", "+0.2", "--end", "+0.5", format="mcap"),
-        "limits": _case(
-            *(four, "--min-range", "2", "--max-range", "9", "--keep-repeated"),
-            *("--exclude-box", "-1,-9,-9,1,9,9", "--exclude-box", "2,-9,-9,3,9,9"),
-        ),
-        "limits organized": _case(
-            *(four, "--min-range", "2", "--exclude-box", "-1,-9,-9,1,9,9"),
-            *("--layout", "organized", "--keep-repeated"),
-        ),
-        "decode": _case(four, "--decode", "firing_azimuth=off", "--decode", "vertical_offset=off"),
-        "decode crc": _case(two, "--decode", "crc=check", "--fault", "bitflip:left:5%"),
-        "optical centre": _case(four, "--only", "right", "--decode", "optical_centre=on"),
-        "ignore": _case(four, "--ignore", "roof", "--ignore", "rear", format="mcap"),
-        "lz4": _case(two, "--compression", "lz4", format="mcap"),
-        "jump split": _case(
-            *(two, "--fault", "jump:left:37s@0.4s", "--fault", "jump:right:37s@0.4s"),
-            *("--on-jump", "split", "--keep-partial"),
-            runs=(Run(jobs=3),),
-        ),
-        "many faults": _case(
-            *(
-                four,
-                "--fault",
-                "drop:left:5%",
-                "--fault",
-                "dup:roof:2%",
-                "--fault",
-                "late:rear:0.1s",
-            ),
-            *("--fault", "reorder:right:3%", "--fault", "truncate:right:1%", "--fault-seed", "5"),
-            *("--keep-partial", "--fault", "delay:roof:60ms"),
-            runs=(_THREE,),
-        ),
-        "early": _case(four, "--fault", "early:left:0.1s", "--keep-partial"),
-        "stall": _case(two, "--fault", "stall:right:0.2s-0.7s", "--max-wait", "0.1"),
-        "resumed npz": _case(
-            *(two, "--keep-partial", "--slices", "2"),
-            runs=(Run(interrupt="open:000004-1.npz"), Run(jobs=3, interrupt="open:000004-0.npz")),
-        ),
-        "resumed mcap": _case(
-            two, "--slices", "2", format="mcap", runs=(Run(interrupt="size:4700000"),)
-        ),
-        "resumed rosbag1": _case(two, format="rosbag1", runs=(Run(interrupt="size:2000000"),)),
-        # Messages that pass through keep the QoS and the definitions of their recording.
-        "bag mcap": _case("bag_mcap", *_PASSED, format="mcap", runs=(_THREE,)),
-        "bag rosbag1": _case("bag_mcap", *_PASSED, format="rosbag1"),
-        "bag rosbag2": _case("bag_mcap", *_PASSED, format="rosbag2", runs=(Run(jobs=3),)),
-        "db3 bag rosbag2": _case("bag_db3", *_PASSED, format="rosbag2"),
-        "bag of ROS 1 mcap": _case("bag_ros1", *_PASSED, format="mcap"),
-        "bag of ROS 1 rosbag1": _case("bag_ros1", *_PASSED, format="rosbag1"),
-        "bag of ROS 1 npz": _case("bag_ros1", "--split"),
-    }
-    for preset in ("velodyne", "ouster", "hesai", "autoware", "kiss-icp", "minimal"):
-        options = ("--point-layout", preset)
-        cases[f"points {preset}"] = _case(four, *options, format="mcap")
-        cases[f"points {preset} organized"] = _case(
-            four, *options, "--layout", "organized", format="rosbag1", runs=()
-        )
-    return cases
-
-
-CASES = _row_cases() | _option_cases()
+CASES = dict(_cases())
 # A query prints JSON; every recording, and those of several lidars.
 QUERIES: Mapping[str, tuple[str, ...]] = {
     **{
@@ -250,7 +118,7 @@ def words_of(case: Case, run: Run) -> list[str]:
     # What has no rig has one lidar, or its poses in the recording.
     words += ["--rig", f"in/{case.recording}/{rig}"] if rig else ["--rate", "20"]
     words += ["--format", case.format, "-o", f"made/{case.output}", "-q"]
-    return [*words, "--jobs", str(run.jobs)]
+    return [*words, "--jobs", run.jobs]
 
 
 # Runs the command line until it is killed. Its clock is fast, so that it keeps its state after
