@@ -85,7 +85,6 @@ SECONDS = (
     "batching/test_page.py",
     "cli/test_bag_mistakes.py",
     "cli/test_clipped.py",
-    "cli/test_clock_epoch.py",
     "cli/test_clocks.py::test_aligned",
     "cli/test_clouds.py",
     "cli/test_compare.py",
