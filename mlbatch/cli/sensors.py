@@ -8,7 +8,7 @@ import typer
 
 from mlbatch.cli.parameters import AsJson
 
-HEAD = ("model", "maker", "channels", "returns", "clock", "calibration", "verified")
+HEAD = ("model", "vendor", "channels", "returns", "clock", "calibration", "verified")
 
 
 def sensors(
@@ -20,7 +20,7 @@ def sensors(
     rows: list[dict[str, object]] = [
         {
             "model": model.name,
-            "maker": model.vendor,
+            "vendor": model.vendor,
             "channels": model.channels,
             "returns": list(model.returns),
             "clock": model.clock,

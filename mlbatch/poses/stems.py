@@ -181,7 +181,7 @@ def _direction(mean: F64Array) -> F64Array | None:
 
 
 def stem_distances(first: Stems, second: Stems, parallel: float, most_m: float) -> Distances:
-    """Compare the axes of two clouds, each with the nearest of the other: two rows a pair.
+    """Compare the axes of two clouds, each with the nearest of the other: two rows per pair.
 
     parallel: least cosine between the directions; most_m: largest distance.
     """
