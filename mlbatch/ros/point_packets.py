@@ -101,7 +101,7 @@ class Layout:
     def __str__(self) -> str:
         if self.slots == 1:
             return "every point is a column"
-        return f"up to {self.slots} points a column {'by ring' if self.by_ring else 'in turn'}"
+        return f"up to {self.slots} points per column {'by ring' if self.by_ring else 'in turn'}"
 
     @property
     def labels_at(self) -> int:

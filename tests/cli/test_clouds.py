@@ -428,7 +428,7 @@ def test_points_of_the_first_packet_are_before_the_header(shell: Shell, tmp_path
 def test_another_field_of_rings(shell: Shell, tmp_path: Path) -> None:
     rig = _rig("{time: delay, unit: ms, from: start, ring: row}")
     assert _run(shell, RECORDINGS["delay"], rig=rig).code == 0
-    assert "up to 16 points a column by ring" in _warnings()[0][1]
+    assert "up to 16 points per column by ring" in _warnings()[0][1]
     with np.load(scan_files(tmp_path / "out")[0]) as scan:
         assert set(scan["ring"].tolist()) == {0, 1, 2, 3}
 

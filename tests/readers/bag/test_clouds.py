@@ -72,7 +72,7 @@ def test_clouds_of_a_bag_come_as_packets(tmp_path: Path, encoding: str) -> None:
         assert recording.notes == []
         assert recording.verdicts == [
             "/left/points: times of points from t (uint32), ns after the header's stamp; up to 2 "
-            "points a column in turn; left out of 8 points: none"
+            "points per column in turn; left out of 8 points: none"
         ]
     assert table.streams == [Stream(topic="/left/points")]
     assert table.untimed == {0}
