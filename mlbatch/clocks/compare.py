@@ -111,10 +111,6 @@ class Comparison(NamedTuple):
     pairs: tuple[Pair, ...]
     corrections: tuple[Correction, ...]
 
-    def apart(self, limit_ns: int) -> tuple[Pair, ...]:
-        """Pairs that differ by more than `limit_ns` for certain, whatever the verdict."""
-        return tuple(pair for pair in self.pairs if pair.least_ns > limit_ns)
-
     def describe(self) -> list[str]:
         """Lines of text: the verdict (of two or more sensors), each sensor, each pair."""
         lines = [f"clocks: {self.verdict}{self._bound()}"] if self.pairs else []

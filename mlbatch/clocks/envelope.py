@@ -200,11 +200,6 @@ class BinRange(NamedTuple):
         kept = np.flatnonzero(~_outliers(offset_ns))
         return rows[kept, 1], offset_ns[kept], self.begin + kept
 
-    def samples(self) -> tuple[I64Array, I64Array]:
-        """Receive time and offset (ns) of the first packet of each bin: typical packets."""
-        rows = self.table.rows[self.begin : self.end, FIRST]
-        return rows[:, 1], rows[:, 0] - rows[:, 1]
-
 
 def _outliers(offset_ns: I64Array) -> BoolArray:
     """Mask of points far above all near them on both sides: damaged stamps, not fast packets."""

@@ -109,9 +109,6 @@ class ClockEstimate(NamedTuple):
     drift_ppm: float | None
     drift_uncertainty_ppm: float | None
     jumps: tuple[Jump, ...]
-    resolution_ns: int  # greatest common divisor of all steps of stamps (0: no step)
-    jitter_p50_ns: int  # median delay of packets relative to the fastest
-    jitter_p99_ns: int  # 99th percentile of it
     segments: tuple[Segment, ...]
     unsteady: bool  # more than MAX_SEGMENTS segments
     mode: str = ""  # time source that the sensor reports
@@ -251,7 +248,6 @@ class ClockWatch:
         quantum_ns = 0
         for one in self._bins:
             quantum_ns = int(np.gcd(quantum_ns, one.quantum_ns))
-        p50_ns, p99_ns = _jitter(track)
         drift = _drift(track)
         scatter_ns = round(3 * envelope.scatter_ns) + quantum_ns * (quantum_ns <= NS_PER_MS)
         burst_ns = BURST_NS * BURST_NS // max(part.span_ns, BURST_NS)
@@ -265,9 +261,6 @@ class ClockWatch:
             drift_ppm=None if drift is None else drift[0] * _PPM,
             drift_uncertainty_ppm=None if drift is None else drift[1] * _PPM,
             jumps=jumps,
-            resolution_ns=quantum_ns,
-            jitter_p50_ns=p50_ns,
-            jitter_p99_ns=p99_ns,
             segments=segments,
             unsteady=self._unsteady,
             mode=self._mode,
@@ -353,16 +346,6 @@ def _jump(step: Step, period_ns: int) -> Jump:
     if step.side != HOST:
         kind = kind_of_jump(before_ns, after_ns, step.size_ns, period_ns)
     return Jump(step.after[1], before_ns, after_ns, step.size_ns, kind, step.side)
-
-
-def _jitter(track: ClockTrack) -> tuple[int, int]:
-    """Median and 99th percentile of the distance of packets from the envelope, ns."""
-    late = []
-    for part, envelope in zip(track.parts, track.envelopes, strict=True):
-        host_ns, offset_ns = part.samples()
-        late.append(np.maximum(envelope.at(host_ns) - offset_ns, 0))
-    p50, p99 = np.quantile(np.concatenate(late), [0.5, 0.99], method="inverted_cdf").tolist()
-    return int(p50), int(p99)
 
 
 def _drift(track: ClockTrack) -> tuple[float, float] | None:

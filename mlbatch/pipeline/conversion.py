@@ -7,7 +7,6 @@ import math
 import time
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple, Protocol, TypeVar
 
 from mlbatch.batching.batcher import SLACK_NS, Batcher
@@ -42,8 +41,7 @@ from mlbatch.units import NS_PER_MS, NS_PER_S, rate_text
 if TYPE_CHECKING:
     from mlbatch.batching.fusion import SweepFusion
     from mlbatch.batching.sweeps import SweepCutter
-    from mlbatch.pipeline.constant_velocity import ConstantVelocity
-    from mlbatch.pipeline.deskew import Deskew, PoseSource
+    from mlbatch.pipeline.deskew import Mover
     from mlbatch.pipeline.pose_check import PoseCheck
 
 # Called with the bytes read so far, the bytes of all recordings, and the scans so far.
@@ -173,12 +171,17 @@ class Conversion:
         self.passthrough.messages.refuse_unknown(self.session.recordings)
         self.info: RunInfo | None = None
         self.table: ScanTable | None = None
-        self.users: list[PacketUser] = []
         self.dropped_incomplete = 0
+        self.users: list[PacketUser] = []
         self.notes_before_points = 0
         self._plain_decoder: Decoder | None = None
-        self.deskew = self._deskew()
-        self.imu_users: list[ImuUser] = [] if self.deskew is None else [self.deskew]
+        self.deskew: Mover | None = None
+        self.imu_users: list[ImuUser] = []
+        if job.deskew:
+            from mlbatch.pipeline.deskew import mover_of
+
+            self.deskew = mover_of(self)
+            self.imu_users.append(self.deskew)
         self.poses = PoseFigures(ONE_LIDAR if job.checks_poses else NOT_ASKED)
         self.pose_check = self._new_pose_check()
         self._buffers = buffers
@@ -204,30 +207,6 @@ class Conversion:
                 )
                 self.warn(Note("max_wait", sensor.name, text))
 
-    def _deskew(self) -> Deskew | ConstantVelocity | None:
-        """The object that moves columns for `--deskew`; None without."""
-        job = self.job
-        if not job.deskew:
-            return None
-        from mlbatch.pipeline.constant_velocity import (
-            CONSTANT_VELOCITY,
-            ConstantVelocity,
-            WindowPoints,
-        )
-
-        slots = [sensor.source.slots for sensor in self.sensors]
-        points = WindowPoints(self.grid, slots, self.plain_scan)
-        if job.deskew == CONSTANT_VELOCITY:
-            return ConstantVelocity(job.deskew_to, points, len(self.sensors))
-        from mlbatch.pipeline.deskew import IMU, Deskew, ImuPoses, Trajectory
-
-        source: PoseSource
-        if job.deskew == IMU:
-            source = ImuPoses(self.sensors, self.session.setup.frames(), self._topic_offset_ns)
-        else:
-            source = Trajectory(Path(job.deskew))
-        return Deskew(source, job.deskew_to, job.max_wait_ns, points, len(self.sensors))
-
     def _new_pose_check(self) -> PoseCheck | None:
         """The object that compares what lidars see; None for one, and with `--no-pose-check`."""
         if not self.job.checks_poses or len(self.sensors) < 2:
@@ -236,7 +215,7 @@ class Conversion:
 
         return PoseCheck(self.sensors, self.job.slices, self.plain_scan)
 
-    def _topic_offset_ns(self, topic: Topic) -> int | None:
+    def topic_offset_ns(self, topic: Topic) -> int | None:
         """Scan clock minus receive time, as for messages of an IMU that are forwarded."""
         if self.passthrough.messages.is_asked_for(topic):
             return self._scan_offset_ns()

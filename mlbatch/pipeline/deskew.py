@@ -1,304 +1,107 @@
 """`--deskew`: columns of each window get the transforms that move their points to one instant.
 
-A window waits until the poses reach its end, at most `--max-wait`, or 2 s. It is moved as a whole:
-if there is no pose at one of its columns, or at its instant, it is left out and its columns are
-counted as `no_pose`.
+Everything here runs in the thread that batches, before a window goes to the decode workers. So the
+result depends on no worker, and shards and resumed runs, which batch everything, get the same.
 """
 
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import Protocol
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from mlbatch.arrays import BoolArray, F64Array, I64Array
+from mlbatch.arrays import F64Array, I64Array
+from mlbatch.batching.grid import Grid
 from mlbatch.batching.windows import Window
-from mlbatch.clocks.timescale import format_difference
-from mlbatch.errors import ClockError, RigError
-from mlbatch.lidar.limits import FAR_POSE_M
-from mlbatch.motion.gravity import STANDSTILL_NS
-from mlbatch.motion.imu import Integrator
+from mlbatch.motion.estimate import Estimate, VelocityEstimator
+from mlbatch.motion.registration import ORIGIN, ColumnCloud
 from mlbatch.motion.track import PoseLine, PoseTrack
 from mlbatch.motion.tum import read_tum
-from mlbatch.pipeline.constant_velocity import WindowPoints
 from mlbatch.pipeline.decode_pool import first_ring_index
-from mlbatch.pipeline.passthrough import IMU_TYPE, NEAR_NS
+from mlbatch.pipeline.imu_poses import IMU, ImuPoses, PoseSource
 from mlbatch.pipeline.rotation_check import RotationCheck
-from mlbatch.pipeline.sensor import Sensor
-from mlbatch.reports.motion import MotionLedger
-from mlbatch.types import ImuSamples, Message, Topic, instant_ns
-from mlbatch.units import NS_PER_MS, NS_PER_S
+from mlbatch.reports.motion import MotionLedger, VelocityCounts
+from mlbatch.types import ImuSamples, Message, Scan, WindowColumns, instant_ns
+from mlbatch.units import NS_PER_S
 
-IMU = "imu"
-# Poses kept before the newest window; sets of sweeps begin less than this before it.
-_KEPT_NS = 5 * NS_PER_S
+if TYPE_CHECKING:
+    from mlbatch.pipeline.conversion import Conversion
+
+CONSTANT_VELOCITY = "constant-velocity"
+# Of a window; of more, every second column is read, or every third.
+_SLOTS = 1 << 16
 # An IMU gives no pose before its first second is complete.
 _LEAST_WAIT_NS = 2 * NS_PER_S
 
 
-class PoseSource(Protocol):
-    """Where poses come from; name: for the report; line: the poses so far."""
+def mover_of(run: Conversion) -> Mover:
+    """The object that moves columns for `--deskew`."""
+    job = run.job
+    points = WindowPoints(run.grid, [sensor.source.slots for sensor in run.sensors], run.plain_scan)
+    if job.deskew == CONSTANT_VELOCITY:
+        return ConstantVelocity(job.deskew_to, points, len(run.sensors))
+    path = Path(job.deskew)
+    source = (
+        ImuPoses(run.sensors, run.session.setup.frames(), run.topic_offset_ns)
+        if job.deskew == IMU
+        else PoseSource(path.name, read_tum(path))
+    )
+    return Deskew(source, job.deskew_to, job.max_wait_ns, points, len(run.sensors))
 
-    name: str
-    line: PoseLine
-    gyro_bias: tuple[float, ...]
+
+class Mover:
+    """Takes windows or their slices, yields them with the transforms of their columns.
+
+    dropped: columns of each sensor in windows that were left out.
+    """
+
+    def __init__(self, counts: MotionLedger, sensors: int) -> None:
+        self._counts = counts
+        self.dropped = [0] * sensors
 
     @property
-    def ended(self) -> str:
-        """Why no poses will be added, if they should; else an empty text."""
-        ...
+    def ledger(self) -> MotionLedger:
+        """Counts so far."""
+        return self._counts
 
     @property
     def integrated_s(self) -> float:
-        """How long velocities were integrated, s."""
-        ...
-
-    @property
-    def is_complete(self) -> bool:
-        """Whether no poses will be added."""
-        ...
+        """How long velocities of an IMU were integrated, s."""
+        return 0.0
 
     def add(self, imu: Iterable[ImuSamples], messages: Iterable[Message]) -> None:
         """Add what a batch of the recording contains."""
-        ...
 
-    def advance(self, oldest_ns: int) -> None:
-        """Compute poses from all that was added; those before a time are not needed."""
-        ...
+    def push(self, window: Window) -> Iterator[Window]:
+        """Add the next window; yield windows whose moves are known."""
+        raise NotImplementedError
 
+    def finish(self) -> Iterator[Window]:
+        """Yield the windows that wait, at the end of input."""
+        raise NotImplementedError
 
-class Trajectory:
-    """Poses of a file, all known from the start."""
-
-    gyro_bias: tuple[float, ...] = ()
-    is_complete = True
-    ended = ""
-
-    def __init__(self, path: Path) -> None:
-        track = read_tum(path)
-        self.name = path.name
-        self.line = PoseLine(track)
-        self.integrated_s = 0.0
-
-    def add(self, imu: Iterable[ImuSamples], messages: Iterable[Message]) -> None:
-        """Nothing: the recording does not add poses."""
-
-    def advance(self, oldest_ns: int) -> None:
-        """Nothing."""
-
-
-class ImuStreams:
-    """Samples of the IMUs of a recording, by the number of their lidar or the name of their topic.
-
-    Stamps of lidars are in the common clock, those of messages as their headers have them.
-    """
-
-    def __init__(self, sensors: Sequence[Sensor]) -> None:
-        self._sensors = sensors
-        self.waiting: dict[int | str, list[_Samples]] = {}
-        self.frame_of: dict[str, str] = {}
-        self.topics: dict[str, Topic] = {}
-
-    def add(self, imu: Iterable[ImuSamples], messages: Iterable[Message]) -> None:
-        """Keep the samples of a batch."""
-        for samples in imu:
-            stamp_ns = samples.stamp_ns + self._sensors[samples.sensor].clock.imu_offset_ns
-            near = np.zeros(len(stamp_ns), np.int64)
-            one = (stamp_ns, samples.acceleration, samples.angular_velocity, near)
-            self._keep(samples.sensor, one)
-        for message in messages:
-            if message.topic.type == IMU_TYPE:
-                found = _sample_of(message)
-                if found is not None:
-                    frame, sample = found
-                    self.frame_of.setdefault(message.topic.name, frame)
-                    self.topics.setdefault(message.topic.name, message.topic)
-                    self._keep(message.topic.name, sample)
-
-    def _keep(self, key: int | str, samples: _Samples) -> None:
-        if len(samples[0]):
-            self.waiting.setdefault(key, []).append(samples)
-
-    def rates(self) -> Iterator[tuple[int | str, I64Array, F64Array]]:
-        """Increasing stamps (n,) of each IMU and its angular velocity (n, 3), its frame, rad/s."""
-        # Lidars before topics.
-        for key in sorted(self.waiting, key=lambda key: (isinstance(key, str), str(key))):
-            parts = self.waiting[key]
-            stamp_ns, _, rate, _ = (np.concatenate(part) for part in zip(*parts, strict=True))
-            stamp_ns, first = np.unique(stamp_ns, return_index=True)
-            yield key, stamp_ns, rate[first]
-
-
-class ImuPoses:
-    """Poses integrated from the first IMU of a lidar, else from the first Imu topic."""
-
-    gyro_bias: tuple[float, ...] = ()
-
-    def __init__(
-        self,
-        sensors: Sequence[Sensor],
-        frames: dict[str, F64Array],
-        offset_ns: Callable[[Topic], int | None],
-    ) -> None:
-        """frames: (4, 4) body_from_frame, m, by name, for recorded topics.
-
-        offset_ns: once there are columns, scan clock minus receive time, by which messages of a
-        topic are forwarded or dropped; None: all are dropped.
-        """
-        self.name = IMU
-        self.line = PoseLine(_NO_POSES)
-        self._sensors = sensors
-        self._frames = frames
-        self._streams = ImuStreams(sensors)
-        self._topic_offset_ns = offset_ns
-        self._chosen: int | str | None = None
-        self._integrator: Integrator | None = None
-        self._newest_ns: int | None = None
-        self._first_ns: int | None = None
-
-    @property
-    def integrated_s(self) -> float:
-        """From the end of the standstill to the last sample."""
-        if self._first_ns is None or self._newest_ns is None:
-            return 0.0
-        return max(0.0, (self._newest_ns - self._first_ns - STANDSTILL_NS) / NS_PER_S)
-
-    @property
-    def is_complete(self) -> bool:
-        """After a gap of the IMU."""
-        return self._integrator is not None and self._integrator.is_lost
-
-    @property
-    def ended(self) -> str:
-        """The gap."""
-        if self._integrator is None or not self._integrator.is_lost:
-            return ""
-        return f"none after a gap of its samples of {self._integrator.gap_ns / NS_PER_MS:.0f} ms"
-
-    def add(self, imu: Iterable[ImuSamples], messages: Iterable[Message]) -> None:
-        """Keep the samples of a batch."""
-        self._streams.add(imu, messages)
-        if self._chosen is not None:
-            self._drop_others(self._chosen)
-
-    def _drop_others(self, key: int | str) -> None:
-        self._streams.waiting = {key: self._streams.waiting.get(key, [])}
-
-    def advance(self, oldest_ns: int) -> None:
-        """Integrate the samples that wait."""
-        if self._chosen is None and not self._choose():
-            return
-        parts = self._streams.waiting.pop(self._chosen, []) if self._chosen is not None else []
-        if not parts or self._integrator is None:
-            return
-        stamp_ns, force, rate, ahead_ns = (
-            np.concatenate(part) for part in zip(*parts, strict=True)
-        )
-        if isinstance(self._chosen, str):
-            near = self._near(self._streams.topics[self._chosen], ahead_ns)
-            stamp_ns, force, rate = stamp_ns[near], force[near], rate[near]
-            if not len(stamp_ns):
-                return
-        # Repeated samples, and samples received after later ones, add nothing.
-        newest = np.maximum.accumulate(stamp_ns)
-        before = np.concatenate([[self._newest_ns or -1], newest[:-1]])
-        fresh = stamp_ns > before
-        if not fresh.any():
-            return
-        self._newest_ns = int(newest[-1])
-        self._first_ns = int(stamp_ns[0]) if self._first_ns is None else self._first_ns
-        track = self._integrator.push(stamp_ns[fresh], force[fresh], rate[fresh])
-        self.gyro_bias = self._integrator.gyro_bias
-        if len(track.stamp_ns):
-            self.line.extend(track, oldest_ns - _KEPT_NS)
-
-    def _near(self, topic: Topic, ahead_ns: I64Array) -> BoolArray:
-        """Which samples (n,) are on the clock of the scans; ClockError if the first is not.
-
-        ahead_ns: their time minus that of their message. The others are not forwarded, either.
-        """
-        offset_ns = self._topic_offset_ns(topic)
-        remedy = "set IMU and lidars to one time source, or give a trajectory (--deskew FILE.tum)"
-        if offset_ns is None:
-            raise ClockError(
-                f"--deskew imu: {topic.name}: expected scans on the clock of its header, found "
-                f"scans on no epoch clock (UTC, TAI); {remedy}"
-            )
-        near: BoolArray = np.abs(ahead_ns - offset_ns) <= NEAR_NS
-        if self._newest_ns is None and not near[0]:
-            raise ClockError(
-                f"--deskew imu: {topic.name}: expected the clock of its header and that of the "
-                "scans within 1 s of each other, found the scans "
-                f"{format_difference(offset_ns - int(ahead_ns[0]))} from it; {remedy}"
-            )
-        return near
-
-    def _choose(self) -> bool:
-        """Choose the IMU; False while there are no samples."""
-        numbers = sorted(key for key in self._streams.waiting if isinstance(key, int))
-        topics = sorted(key for key in self._streams.waiting if isinstance(key, str))
-        for number in numbers:
-            sensor = self._sensors[number]
-            sensor_from_imu = sensor.lidar.sensor_from_imu()
-            if sensor_from_imu is not None:
-                pose = sensor.body_from_sensor @ sensor_from_imu
-                return self._use(number, pose, f"the IMU of {sensor.name}")
-        for topic in topics:
-            frame = self._streams.frame_of[topic].lstrip("/")
-            if frame not in self._frames:
-                raise RigError(
-                    f"--deskew imu: {topic}: expected a static transform to the frame {frame!r}, "
-                    "found none; record /tf_static, or give a trajectory (FILE.tum)"
-                )
-            return self._use(topic, self._frames[frame], f"the IMU {topic}")
+    def awaits(self, newest_ns: int) -> bool:
+        """Whether windows wait for poses that may come; newest_ns: newest stamp of all sensors."""
         return False
 
-    def _use(self, key: int | str, body_from_imu: F64Array, name: str) -> bool:
-        away_m = float(np.linalg.norm(body_from_imu[:3, 3]))
-        if not away_m <= FAR_POSE_M:
-            raise RigError(
-                f"--deskew imu: {name}: expected it within {FAR_POSE_M:g} m of the body origin, "
-                f"found {away_m:g} m; give its static transform in metres, or a trajectory "
-                "(FILE.tum)"
-            )
-        self._chosen = key
-        self._drop_others(key)
-        self.name = name
-        self._integrator = Integrator(body_from_imu, name)
-        return True
+    def oldest_ring_index(self, sensor: int) -> int | None:
+        """First ring index of a sensor in the windows that wait; None: none."""
+        raise NotImplementedError
 
 
-# Stamps (n,), specific force (n, 3) in m/s2, angular velocity (n, 3) in rad/s, stamps minus times
-# of messages (n,).
-_Samples = tuple[I64Array, F64Array, F64Array, I64Array]
-_NO_POSES = PoseTrack(np.zeros(0, np.int64), np.zeros((0, 3, 3)), np.zeros((0, 3)))
+# -- by poses -------------------------------------------------------------------------------------
 
 
-def _sample_of(message: Message) -> tuple[str, _Samples] | None:
-    """Frame and sample of a sensor_msgs/Imu; None for a damaged one."""
-    from mlbatch.outputs.damage import DamageError
-    from mlbatch.outputs.encoding import MessageCursor
+class Deskew(Mover):
+    """By poses; a window waits until they reach its end, at most `--max-wait`, or 2 s.
 
-    try:
-        cursor = MessageCursor.of_message(message.data, message.topic.encoding)
-        stamp_ns, frame = cursor.header()
-        values = np.array(cursor.floats(37))
-    except DamageError:
-        return None
-    # Orientation and its covariance, angular velocity and its, acceleration and its.
-    rate, force = values[13:16], values[25:28]
-    if not np.isfinite(values[13:28]).all() or stamp_ns <= 0:
-        return None
-    ahead_ns = np.array([stamp_ns - message.host_ns])
-    return frame, (np.array([stamp_ns]), force[None], rate[None], ahead_ns)
-
-
-class Deskew:
-    """Takes windows, yields them with the transforms of their columns."""
+    It is moved as a whole: if there is no pose at one of its columns, or at its instant, it is left
+    out and its columns are counted as `no_pose`.
+    """
 
     def __init__(
         self,
@@ -312,14 +115,11 @@ class Deskew:
 
         points: what reads the points of windows, for the check.
         """
+        super().__init__(MotionLedger(source.name, to), sensors)
         self.source = source
-        self._to = to
         self._max_wait_ns = None if max_wait_ns is None else max(max_wait_ns, _LEAST_WAIT_NS)
         self._waiting: deque[Window] = deque()
-        self._counts = MotionLedger(source.name, to)
         self._check = RotationCheck(points)
-        # Columns of each sensor in windows that were left out.
-        self.dropped = [0] * sensors
 
     @property
     def integrated_s(self) -> float:
@@ -331,10 +131,10 @@ class Deskew:
         self.source.add(imu, messages)
 
     def push(self, window: Window) -> Iterator[Window]:
-        """Add the next window; yield windows whose poses are known."""
+        """Add the next window."""
         self._waiting.append(window)
         self.source.advance(self._waiting[0].start_ns)
-        while self._waiting and self._is_due(window.end_ns):
+        while self._waiting and self._is_known(self._waiting[0].end_ns, window.end_ns):
             yield from self._moved(self._waiting.popleft())
 
     def finish(self) -> Iterator[Window]:
@@ -368,9 +168,6 @@ class Deskew:
             rotation=self._check.outcome,
         )
 
-    def _is_due(self, newest_end_ns: int) -> bool:
-        return self._is_known(self._waiting[0].end_ns, newest_end_ns)
-
     def _is_known(self, end_ns: int, now_ns: int) -> bool:
         """Whether the poses of a window are known at a time, or are not waited for."""
         newest_ns = self.source.line.newest_ns
@@ -382,7 +179,7 @@ class Deskew:
         columns = window.columns
         counts = self._counts
         counts.columns += len(columns)
-        to_ns = instant_ns(self._to, window.start_ns, window.end_ns)
+        to_ns = instant_ns(self._counts.to, window.start_ns, window.end_ns)
         line = self.source.line
         if not line.has_poses(columns.stamp_ns, to_ns):
             counts.windows_without_poses += 1
@@ -398,3 +195,156 @@ class Deskew:
         world_from_body[:3, :3], world_from_body[:3, 3] = pose.rotation[0], pose.position_m[0]
         columns = replace(columns, moves=moves)
         yield replace(window, columns=columns, world_from_body=world_from_body)
+
+
+# -- by the points of windows ---------------------------------------------------------------------
+
+
+class WindowCloud(NamedTuple):
+    """The points of a window; start_ns, end_ns: of it; slices: that it was cut to."""
+
+    cloud: ColumnCloud
+    start_ns: int
+    end_ns: int
+    slices: list[Window]
+
+
+class WindowPoints:
+    """Takes windows or their slices, reads points of some columns, yields whole windows."""
+
+    def __init__(
+        self, grid: Grid, slots: list[int], decode: Callable[[WindowColumns, int, int], Scan]
+    ) -> None:
+        """slots: of a column of each sensor; decode: `Conversion.plain_scan`."""
+        self._grid = grid
+        self._slots = slots
+        self._decode = decode
+        # Slices of the window that is not complete, and their points.
+        self._slices: list[Window] = []
+        self._clouds: list[ColumnCloud] = []
+
+    def add(self, window: Window) -> Iterator[WindowCloud]:
+        """Add the next window or slice; yield windows that are complete."""
+        if self._slices and self._slices[-1].index != window.index:
+            yield from self.release()
+        self._slices.append(window)
+        self._clouds.append(self._points(window))
+        if window.slice == self._grid.slices - 1:
+            yield from self.release()
+
+    def release(self) -> Iterator[WindowCloud]:
+        """The window that waits for slices."""
+        if not self._slices:
+            return
+        slices, clouds = self._slices, self._clouds
+        self._slices, self._clouds = [], []
+        yield WindowCloud(_joined(clouds), *self._span_ns(slices[0]), slices)
+
+    def oldest_ring_index(self, sensor: int) -> int | None:
+        """First ring index of a sensor in the slices that wait; None: none."""
+        return first_ring_index(self._slices, sensor)
+
+    def _span_ns(self, window: Window) -> tuple[int, int]:
+        """Start and end of the whole window that a slice belongs to; of a set of sweeps its own."""
+        slices = self._grid.slices
+        if slices == 1:
+            return window.start_ns, window.end_ns
+        number = self._grid.index_of(window.start_ns) // slices
+        return self._grid.bound(number * slices), self._grid.bound((number + 1) * slices)
+
+    def _points(self, window: Window) -> ColumnCloud:
+        """Points of some columns; columns of each sensor are taken at equal steps."""
+        columns = window.columns
+        counts = [int(np.count_nonzero(columns.sensor == one)) for one in range(len(self._slots))]
+        total = sum(count * slots for count, slots in zip(counts, self._slots, strict=True))
+        step = max(1, -(-total * self._grid.slices // _SLOTS))
+        taken: list[I64Array] = [
+            np.flatnonzero(columns.sensor == sensor)[::step] for sensor in range(len(self._slots))
+        ]
+        some = columns.take(np.sort(np.concatenate(taken)))
+        start_ns, end_ns = self._span_ns(window)
+        time_s: F64Array = (some.stamp_ns - (start_ns + end_ns) // 2) / NS_PER_S
+        scan = self._decode(some, window.start_ns, window.end_ns)
+        if scan.column is None:
+            raise TypeError("expected scans with columns")
+        return ColumnCloud(scan.xyz.astype(np.float64), scan.column.astype(np.int64), time_s)
+
+
+class ConstantVelocity(Mover):
+    """By the velocity that the points of each window give; unmoved where they give none."""
+
+    def __init__(self, to: str, points: WindowPoints, sensors: int) -> None:
+        """to: a word of INSTANTS; points: what reads the points of windows."""
+        super().__init__(MotionLedger(CONSTANT_VELOCITY, to, velocity=VelocityCounts()), sensors)
+        self._points = points
+        self._estimator = VelocityEstimator()
+
+    def push(self, window: Window) -> Iterator[Window]:
+        """Add the next window or slice; yield all slices of complete windows."""
+        for whole in self._points.add(window):
+            yield from self._moved(whole)
+
+    def finish(self) -> Iterator[Window]:
+        """End of input."""
+        for whole in self._points.release():
+            yield from self._moved(whole)
+
+    def oldest_ring_index(self, sensor: int) -> int | None:
+        """First ring index of a sensor in the slices that wait; None: none."""
+        return self._points.oldest_ring_index(sensor)
+
+    def _moved(self, whole: WindowCloud) -> Iterator[Window]:
+        cloud, start_ns, end_ns, slices = whole
+        middle_ns = (start_ns + end_ns) // 2
+        estimate = self._estimator.add(cloud, middle_ns, end_ns - start_ns)
+        self._count(estimate, slices)
+        if estimate.velocity is None or estimate.reason:
+            yield from slices
+            return
+        line = _line(estimate.velocity, start_ns, end_ns)
+        for window in slices:
+            columns = window.columns
+            to_ns = instant_ns(self._counts.to, window.start_ns, window.end_ns)
+            moves = line.moves(columns.stamp_ns, to_ns)
+            yield replace(window, columns=replace(columns, moves=moves))
+
+    def _count(self, estimate: Estimate, slices: list[Window]) -> None:
+        counts = self._counts
+        columns = sum(len(window.columns) for window in slices)
+        counts.columns += columns
+        velocity = counts.velocity
+        if velocity is None:
+            return
+        if estimate.residual_m is not None:
+            counts.poses += 1
+            velocity.residual_m.append(estimate.residual_m)
+        if not estimate.reason:
+            counts.moved += columns
+            return
+        velocity.unmoved += columns
+        velocity.add_window(estimate.reason, slices[0].index)
+
+
+def _joined(clouds: list[ColumnCloud]) -> ColumnCloud:
+    """The points of all slices of a window."""
+    if len(clouds) == 1:
+        return clouds[0]
+    before = np.cumsum([0, *(len(one.time_s) for one in clouds[:-1])])
+    return ColumnCloud(
+        np.concatenate([one.points_m for one in clouds]),
+        np.concatenate([one.column + base for one, base in zip(clouds, before, strict=True)]),
+        np.concatenate([one.time_s for one in clouds]),
+    )
+
+
+def _line(velocity: F64Array, start_ns: int, end_ns: int) -> PoseLine:
+    """The poses of a motion with a constant twist, from the start to the end of a window."""
+    end = ORIGIN.then(velocity * ((end_ns - start_ns) / NS_PER_S))
+    return PoseLine(
+        PoseTrack(
+            np.array([start_ns, end_ns], np.int64),
+            np.stack([ORIGIN.rotation, end.rotation]),
+            np.stack([ORIGIN.position_m, end.position_m]),
+            CONSTANT_VELOCITY,
+        )
+    )

@@ -20,7 +20,7 @@ from mlbatch.units import NS_PER_S
 
 if TYPE_CHECKING:
     from mlbatch.batching.windows import Window
-    from mlbatch.pipeline.constant_velocity import WindowPoints
+    from mlbatch.pipeline.deskew import WindowPoints
 
 # Windows that are compared, and that are registered for it at most.
 _WINDOWS = 40

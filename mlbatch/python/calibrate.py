@@ -22,7 +22,7 @@ from mlbatch.motion.gravity import standing_gravity, tilt_deg
 from mlbatch.motion.registration import ORIGIN, Pose
 from mlbatch.motion.se3 import exp_rotation
 from mlbatch.pipeline.conversion import Conversion, Progress
-from mlbatch.pipeline.deskew import ImuStreams
+from mlbatch.pipeline.imu_poses import ImuStreams
 from mlbatch.pipeline.job import Job
 from mlbatch.poses.calibration import (
     MOST_OFF_DEG,

@@ -193,10 +193,8 @@ def test_too_few_packets_give_no_verdict() -> None:
     near = compared(TRUE, TRUE, seconds=0.005)
     assert near.verdict == UNSYNCHRONISED
     assert near.pairs[0].why.startswith("too few packets")
-    assert near.apart(NS_PER_S) == ()
     far = compared(UPTIME, replace(UPTIME, offset_ns=0), seconds=0.005)
     assert far.pairs[0].why.startswith("apart, and too few packets")
-    assert len(far.apart(NS_PER_S)) == 1
 
 
 def test_sensors_that_were_never_seen_together() -> None:
@@ -205,11 +203,6 @@ def test_sensors_that_were_never_seen_together() -> None:
     assert comparison.verdict == SYNCHRONISED
     # 30 s at 100 ppm.
     assert comparison.pairs[0].uncertainty_ns > 3 * NS_PER_MS
-
-
-def test_wild_pairs_are_found_whatever_the_verdict() -> None:
-    comparison = compared(TRUE, Clock(TAI_NS), Clock(500 * NS_PER_MS))
-    assert {(pair.one, pair.two) for pair in comparison.apart(NS_PER_S)} == {("a", "b"), ("b", "c")}
 
 
 @pytest.mark.parametrize(
