@@ -25,8 +25,8 @@ def merge(
     from mlbatch.cli.summary import exit_beyond, print_summary, say
     from mlbatch.errors import one_line
     from mlbatch.pipeline.interrupts import interruptible
-    from mlbatch.pipeline.merge import merge as merge_parts
-    from mlbatch.pipeline.merge import read_parts
+    from mlbatch.pipeline.shards import merge as merge_parts
+    from mlbatch.pipeline.shards import read_parts
     from mlbatch.reports.limits import exceeded, parse_limits
 
     limits = parse_limits(values["fail_on"] or ())

@@ -25,8 +25,7 @@ from mlbatch.discovery.first_seconds import is_without_packets
 from mlbatch.errors import UsageError
 from mlbatch.frames.tree import some
 from mlbatch.native import require_library
-from mlbatch.pipeline.extract_files import side_files
-from mlbatch.pipeline.extract_places import Assigned, ChosenLidar, Place, Places
+from mlbatch.pipeline.extract_places import Assigned, ChosenLidar, Place, Places, side_files
 from mlbatch.pipeline.passthrough import MessageQueue
 from mlbatch.pipeline.time_limits import refuse_outside, text_of_range
 from mlbatch.readers import has_packets, open_recordings

@@ -1,5 +1,7 @@
 """Where the raw packets of chosen lidars go in another container: addresses and ports, or topics.
 
+Next to it are files with the calibrations and a rig, where the container lacks them.
+
 Packets keep the address or topic that they were recorded with. Where they have none, those of the
 vendor's drivers are used (`Recorded`), and an address of its own for each lidar.
 """
@@ -7,16 +9,19 @@ vendor's drivers are used (`Recorded`), and an address of its own for each lidar
 from __future__ import annotations
 
 import ipaddress
+import os
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import Enum
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
 from mlbatch import sensors
 from mlbatch.arrays import BoolArray, I64Array, U8Array
+from mlbatch.discovery.calibrations import is_metadata
 from mlbatch.discovery.discover import Discovery
 from mlbatch.discovery.match import describe
 from mlbatch.discovery.router import Role
@@ -24,11 +29,14 @@ from mlbatch.discovery.sampler import are_neighbours, split_by_kind
 from mlbatch.discovery.types import DetectedSensor, PacketKind
 from mlbatch.lidar.interface import Recorded
 from mlbatch.readers import has_packets
-from mlbatch.rig.rig import StreamSelector
+from mlbatch.rig.rig import DEFAULT_BODY_FRAME, Rig, RigSensor, StreamSelector, UnknownExtrinsics
+from mlbatch.rig.write import write_rig
 from mlbatch.ros.definitions import definition_text
 from mlbatch.ros.packet_writing import PacketMessages
 from mlbatch.types import PacketBatch, Stream, Topic
 
+# Options of a rig that the command has applied.
+_APPLIED = ("only", "ignore", "pass")
 # Of the first lidar that was recorded without one; the next ones follow.
 FIRST_ADDRESS = ipaddress.IPv4Address("192.168.1.201")
 _SAMPLE = 16
@@ -287,3 +295,88 @@ def _describes_device(
         axis=1
     )
     return same
+
+
+# -- files next to the recording -------------------------------------------------------------------
+
+
+def side_files(
+    places: Places, target: Path, topics: frozenset[Topic], *, selects: bool
+) -> dict[Path, bytes]:
+    """Calibrations and the rig by their paths; a calibration in the folder is not copied.
+
+    topics: that are copied; selects: lidars are chosen by name, which a rig need not repeat.
+    """
+    setup = places.setup
+    carried = {topic.name for topic in topics}
+    recorded = setup.first.metadata.calibration_texts
+    files: dict[Path, bytes] = {}
+    # By where it comes from: lidars may share one.
+    known: dict[str, Path] = {}
+    metadata: dict[str, Path] = {}
+    for sensor in setup.sensors:
+        origin = sensor.lidar.calibration
+        is_file = bool(origin) and Path(origin).is_file()
+        if origin in carried or not (origin in recorded or is_file):
+            continue
+        if origin not in known:
+            content = recorded[origin] if origin in recorded else Path(origin).read_bytes()
+            suffix = _suffix(content) if origin in recorded else Path(origin).suffix
+            known[origin] = target.with_name(f"{target.stem}.{sensor.name}{suffix}")
+            if is_file and os.path.samefile(Path(origin).parent, target.parent):
+                known[origin] = Path(origin)
+            else:
+                files[known[origin]] = content
+        metadata[sensor.name] = known[origin]
+    is_capture = not places.encodings
+    lacks_frames = any(
+        is_metadata(topic) and not has_packets(topic) and topic not in topics
+        for recording in setup.recordings
+        for topic in recording.topics
+    )
+    streams = setup.sampler.table.streams
+    moves = any(bool(streams[one.stream].topic) == is_capture for one in setup.sampler.kinds)
+    # Also where files are copied: with those of other extracts they may be ambiguous.
+    if setup.sensors and (setup.rig is not None or lacks_frames or moves or files):
+        rig = _rig(places, metadata, lacks_frames=lacks_frames, selects=selects)
+        path = target.with_name(f"{target.stem}.rig.yaml")
+        files[path] = write_rig(rig, target.parent).encode()
+    # An earlier extract may share them.
+    return {
+        path: content
+        for path, content in files.items()
+        if not (path.is_file() and path.read_bytes() == content)
+    }
+
+
+def _suffix(content: bytes) -> str:
+    """Suffix of a recorded calibration, by its content: JSON, angles as text or as bytes."""
+    if content.lstrip().startswith(b"{"):
+        return ".json"
+    return ".csv" if content.isascii() else ".dat"
+
+
+def _rig(places: Places, metadata: dict[str, Path], *, lacks_frames: bool, selects: bool) -> Rig:
+    """The rig of the chosen lidars; lacks_frames: the new recording has no transforms."""
+    setup = places.setup
+    streams = setup.sampler.table.streams
+    found = []
+    for number, sensor in enumerate(setup.sensors):
+        known = UnknownExtrinsics() if not sensor.pose.is_known else sensor.pose.body_from_sensor
+        rig = sensor.rig or RigSensor(sensor.name, extrinsics=known)
+        extrinsics = known if isinstance(rig.extrinsics, str) and lacks_frames else rig.extrinsics
+        place = places.main_place(number)
+        stream = rig.stream
+        if place is not None and (sensor.rig is None or place.to != streams[place.stream]):
+            stream = places.selector(number)
+        path = metadata.get(sensor.name, rig.metadata)
+        found.append(replace(rig, stream=stream, metadata=path, extrinsics=extrinsics))
+    if setup.rig is not None:
+        kept = tuple(
+            option
+            for option in setup.rig.options
+            if option.name not in _APPLIED or (option.name != "pass" and not selects)
+        )
+        return replace(setup.rig, sensors=tuple(found), options=kept)
+    names = {sensor.name for sensor in found}
+    return Rig(tuple(found), DEFAULT_BODY_FRAME if setup.frame_id in names else setup.frame_id)

@@ -369,8 +369,9 @@ def inspect(
         notes=(
             *_notes(discovery),
             *_late_notes(discovery, early),
-            *measured.other_lidars(discovery),
-            *_clock_notes(known),
+            *measured.other_lidars(),
+            # One by one: they may not be comparable.
+            *filter(None, (describe_off([HostOffset.measured(*one)]) for one in known)),
             *([] if rig is not None else _dataset_notes(discovery)),
         ),
         clocks=compare(known) if known else None,
@@ -428,14 +429,6 @@ def _dataset_notes(discovery: Discovery) -> Iterator[str]:
         from mlbatch.rig.recipes import by_topics, proposal
 
         yield from filter(None, [proposal(by_topics(topics))])
-
-
-def _clock_notes(known: Sequence[tuple[str, ClockEstimate]]) -> Iterator[str]:
-    """Clocks that are off from the capture host's, one by one: they may not be comparable."""
-    for name, finding in known:
-        text = describe_off([HostOffset.measured(name, finding)])
-        if text:
-            yield text
 
 
 def _selector(table: StreamTable, sensor: DetectedSensor) -> StreamSelector:
@@ -499,18 +492,20 @@ def _notes(discovery: Discovery) -> Iterator[str]:
 class _Measured:
     """Packets as a run accepts them: their loss and clocks by sensor, and packets of no sensor.
 
-    sent: of each sensor, kinds with a packet of it; one that begins late may be of another.
+    firsts: of each sensor, its first timestamp and its receive time, ns; sent: kinds with a packet
+    of it; one that begins late may be of another.
     """
 
     def __init__(self, discovery: Discovery) -> None:
+        self._discovery = discovery
         self._arena = PacketArena()
         self._sensors = sensors_of(discovery, Job(()), self._arena)
-        self._firsts: list[tuple[int, int] | None] = [None for _ in self._sensors]
+        self.firsts: list[tuple[int, int] | None] = [None for _ in self._sensors]
         self.sent: list[set[PacketKind]] = [set() for _ in self._sensors]
         # Steps of a clock are shown, not refused: loss is counted as with `--clock host`, and
         # clocks are watched before anything is rejected, as for `--align-clocks`.
-        self._intakes = [sensor.intake(host_clock=True) for sensor in self._sensors]
-        self._losses = Ingest(discovery.router, self._sensors, self._intakes)
+        self.intakes = [sensor.intake(host_clock=True) for sensor in self._sensors]
+        self._losses = Ingest(discovery.router, self._sensors, self.intakes)
         shown = [sensor.unread(self._arena) for sensor in self._sensors]
         self._ingest = Ingest(discovery.router, shown, [sensor.clock_intake() for sensor in shown])
 
@@ -524,39 +519,31 @@ class _Measured:
             kinds = split_by_kind(batch.take(accepted.position))
             self.sent[number].update(kind for kind, _ in kinds)
             valid = accepted.columns.valid
-            if self._firsts[number] is None and valid.any():
+            if self.firsts[number] is None and valid.any():
                 row, column = np.argwhere(valid)[0]
                 stamp_ns = int(accepted.columns.stamp_ns[row, column])
-                self._firsts[number] = stamp_ns, int(accepted.host_ns[row])
-
-    def lost(self, number: int) -> int:
-        """Lost packets of a sensor."""
-        return self._intakes[number].loss.lost
+                self.firsts[number] = stamp_ns, int(accepted.host_ns[row])
 
     def estimates(self) -> list[tuple[str, ClockEstimate]]:
         """Name and clock of each sensor whose packets have receive times."""
         found = ((sensor.name, sensor.clock.watch.estimate()) for sensor in self._sensors)
         return [(name, estimate) for name, estimate in found if estimate is not None]
 
-    def first(self, number: int) -> tuple[int, int] | None:
-        """First timestamp of a sensor and its receive time, ns; None without."""
-        return self._firsts[number]
-
     def offset_ns(self, number: int) -> int | None:
         """Clock minus the capture host's; by the log time of a message where that is all."""
         estimate = self._sensors[number].clock.watch.estimate()
         if estimate is not None:
             return estimate.offset_ns
-        first = self._firsts[number]
+        first = self.firsts[number]
         return None if first is None else first[0] - first[1]
 
-    def other_lidars(self, discovery: Discovery) -> Iterator[str]:
+    def other_lidars(self) -> Iterator[str]:
         """Lidars that share the address of a sensor."""
-        kinds = {kind for sensor in discovery.sensors for kind in sensor.kinds}
+        kinds = {kind for sensor in self._discovery.sensors for kind in sensor.kinds}
         for (kind, _), packets in sorted(self._ingest.unassigned.items(), key=lambda one: one[0]):
             what = describe_each(kind.size, packets.sample) if kind in kinds else None
             if what is not None and "lidar" in what:
-                stream = discovery.sampler.table.streams[kind.stream]
+                stream = self._discovery.sampler.table.streams[kind.stream]
                 yield (
                     f"{stream}: {what} as well; {packets.packets} packets are of no sensor; "
                     "give its --metadata"
@@ -669,7 +656,7 @@ def _stream_report(
         )
     sensor = discovery.sensors[number]
     lidar = sensor.lidar
-    first = measured.first(number)
+    first = measured.firsts[number]
     offset_ns = measured.offset_ns(number)
     return replace(
         report,
@@ -678,7 +665,7 @@ def _stream_report(
         model=lidar.model,
         mode=lidar.mode,
         serial=lidar.serial,
-        lost=measured.lost(number),
+        lost=measured.intakes[number].loss.lost,
         timescale="" if first is None else timescale(*first),
         offset_ms=None if offset_ns is None else offset_ns / NS_PER_MS,
         calibration=Path(lidar.calibration).name,

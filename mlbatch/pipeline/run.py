@@ -20,8 +20,7 @@ from mlbatch.pipeline import run_report
 from mlbatch.pipeline.conversion import Conversion, Progress, SkippedWindow
 from mlbatch.pipeline.decode_pool import DecodeTask, DecodeWorker
 from mlbatch.pipeline.job import Job
-from mlbatch.pipeline.scan_task import ScanTask, forward
-from mlbatch.pipeline.workers import OrderedWorkers, run_inline
+from mlbatch.pipeline.workers import OrderedWorkers, ScanTask, forward, run_inline
 from mlbatch.reports.report import RunReport, fill_totals, imbalances, report_text
 from mlbatch.types import ImuSamples, Message, RunInfo, Summary
 from mlbatch.units import NS_PER_S

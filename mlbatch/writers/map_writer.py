@@ -23,7 +23,7 @@ from mlbatch.arrays import I64Array
 from mlbatch.clocks.timescale import TAI, UTC
 from mlbatch.errors import ExportError, RigError, UsageError, install_extra, one_line
 from mlbatch.motion.se3 import rotated
-from mlbatch.reports.map_figures import MapFigures
+from mlbatch.reports.report import MapFigures
 from mlbatch.types import RunInfo, Scan, Summary
 from mlbatch.units import NS_PER_S
 from mlbatch.writers.atomic import export_errors, prepare

@@ -71,7 +71,7 @@ NEEDLESS = (
     "mlbatch.simulate.interface",
     *("mlbatch.cli.batch", "mlbatch.cli.convert_remote", "mlbatch.batch.task"),
     *("mlbatch.cli.digest", "mlbatch.digests.golden"),
-    *("mlbatch.pipeline.deskew", "mlbatch.motion.se3", "mlbatch.pipeline.merge"),
+    *("mlbatch.pipeline.deskew", "mlbatch.motion.se3"),
     *("mlbatch.batching.fusion", "mlbatch.batching.sweeps", "mlbatch.pipeline.shards"),
     *("numpy.ma", "rosbags", "rich", "mcap.writer", "importlib.metadata"),
     *("mlbatch.readers.capture.odd", "dpkt", "mlbatch.page.templates", "jinja2"),

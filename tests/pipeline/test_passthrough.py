@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from mlbatch.errors import ExportError
-from mlbatch.pipeline import message_spill, passthrough
+from mlbatch.pipeline import passthrough
 from mlbatch.pipeline.passthrough import ImuQueue, MessageQueue
 from mlbatch.reports.ledger import DecodedCounts
 from mlbatch.types import ImuSamples, Message, Topic
@@ -91,7 +91,7 @@ def test_messages_in_a_file_come_as_those_in_memory(
     with (
         patch.object(passthrough, "_MEMORY_BYTES", memory_bytes),
         patch.object(passthrough, "_FAR_NS", far_ns),
-        patch.object(message_spill, "_READ_BYTES", 70),
+        patch.object(passthrough, "_READ_BYTES", 70),
     ):
         in_file = MessageQueue([], frozenset({"cdr"}))
         left = messages
@@ -131,8 +131,8 @@ def test_memory_does_not_depend_on_the_messages_that_wait() -> None:
 
 
 def test_a_full_disk_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
-    small = f"PRAGMA max_page_count = 200; {message_spill._BEGIN}"
-    monkeypatch.setattr(message_spill, "_BEGIN", small)
+    small = f"PRAGMA max_page_count = 200; {passthrough._BEGIN}"
+    monkeypatch.setattr(passthrough, "_BEGIN", small)
     queue = MessageQueue([], frozenset({"cdr"}))
     with pytest.raises(ExportError, match=r"disk is full.*set TMPDIR") as error:
         queue.add(Message(TOPICS[0], at, bytes(300_000)) for at in range(20))
