@@ -313,6 +313,25 @@ class WindowColumns:
 
 
 @dataclass(slots=True)
+class Window:
+    """Columns of all sensors in one window or slice, sorted by stamp, sensor, order of delivery."""
+
+    index: int  # number of the window from t_init, -1 for the one before (the head)
+    slice: int  # within the window
+    start_ns: int  # inclusive
+    end_ns: int  # exclusive
+    complete: bool  # every sensor covers the window in time
+    ready_host_ns: int  # receive time of the packet that closed it
+    columns: WindowColumns
+    figures: WindowFigures = ()  # by sensor
+    edge_gap_ns: tuple[int, ...] = ()  # by sensor, widest gap at either bound
+    # By sensor: see `FillMeter` in `batching/fill.py`.
+    fill: F32Array = field(default_factory=lambda: np.zeros(0, np.float32))
+    is_partial: bool = False  # the head or the tail
+    world_from_body: F64Array | None = None  # as of `Scan`
+
+
+@dataclass(slots=True)
 class ColumnHeaders:
     """Headers of the C columns of P packets, read before any pixel is decoded."""
 

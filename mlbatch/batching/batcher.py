@@ -28,10 +28,10 @@ from mlbatch.batching.fill import UNKNOWN_PACE, EdgeGaps, FillMeter, Pace
 from mlbatch.batching.grid import Grid
 from mlbatch.batching.intake import FOREVER, NEVER, STEP_NS, Accepted, Intake
 from mlbatch.batching.merge import ColumnMerge
-from mlbatch.batching.windows import Policy, Schedule, Window
+from mlbatch.batching.windows import Policy, Schedule
 from mlbatch.clocks.compare import refuse_incomparable
 from mlbatch.errors import ClockJump
-from mlbatch.types import Columns, WindowColumns, WindowFigures
+from mlbatch.types import Columns, Window, WindowColumns, WindowFigures
 from mlbatch.units import NS_PER_MS, NS_PER_S
 
 # Allowed lateness.

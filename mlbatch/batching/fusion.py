@@ -24,8 +24,7 @@ from mlbatch.batching.sweeps import (
     SweepCutter,
     publication_order,
 )
-from mlbatch.batching.windows import Window
-from mlbatch.types import ColumnFigures, Columns, WindowColumns
+from mlbatch.types import ColumnFigures, Columns, Window, WindowColumns
 from mlbatch.units import NS_PER_S
 
 # By the words of `--batching`.

@@ -10,9 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
-from mlbatch.arrays import F32Array, F64Array
 from mlbatch.batching.grid import Grid
-from mlbatch.types import WindowColumns, WindowFigures
 from mlbatch.units import NS_PER_S
 
 # Words of `--batching`: windows are on the grid; the others are policies of `fusion.py`.
@@ -76,25 +74,6 @@ class Policy(NamedTuple):
     end: Limit | None = None  # windows start before it
     covered: Coverage | None = None  # by the scans that are batched again
     partial_if_short: bool = False  # also write them where no window is whole, in less than two
-
-
-@dataclass(slots=True)
-class Window:
-    """Columns of all sensors in one window or slice, sorted by stamp, sensor, order of delivery."""
-
-    index: int  # number of the window from t_init, -1 for the one before (the head)
-    slice: int  # within the window
-    start_ns: int  # inclusive
-    end_ns: int  # exclusive
-    complete: bool  # every sensor covers the window in time
-    ready_host_ns: int  # receive time of the packet that closed it
-    columns: WindowColumns
-    figures: WindowFigures  # by sensor
-    # By sensor: see `EdgeGaps` and `FillMeter` in `fill.py`.
-    edge_gap_ns: tuple[int, ...]
-    fill: F32Array
-    is_partial: bool  # the head or the tail
-    world_from_body: F64Array | None = None  # as of `Scan`
 
 
 class Schedule:

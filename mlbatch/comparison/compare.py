@@ -27,7 +27,6 @@ from mlbatch.batching.sweeps import (
     publication_order,
     sweeps_of,
 )
-from mlbatch.batching.windows import Window
 from mlbatch.discovery.types import Note
 from mlbatch.errors import RecordingError
 from mlbatch.page.policies import HEAD, Distribution, PolicyFigures
@@ -35,6 +34,7 @@ from mlbatch.pipeline import run_report
 from mlbatch.pipeline.conversion import Conversion, Progress, sweep_cutter
 from mlbatch.pipeline.job import Job
 from mlbatch.pipeline.sensor import Sensor
+from mlbatch.types import Window
 from mlbatch.units import NS_PER_MS, NS_PER_S, rate_text
 
 if TYPE_CHECKING:

@@ -15,12 +15,11 @@ import numpy as np
 from mlbatch.arrays import BoolArray, F32Array, F64Array, I64Array
 from mlbatch.batching.fusion import MOST_AGE_NS
 from mlbatch.batching.sweeps import Sweep, SweepSet, sweeps_of
-from mlbatch.batching.windows import Window
 from mlbatch.page.clouds import CloudPoints
 from mlbatch.page.instant import RADIUS_M, InstantSet, SharedInstant, Spot
 from mlbatch.pipeline.decode_pool import first_ring_index
 from mlbatch.pipeline.sensor import Sensor
-from mlbatch.types import Scan, WindowColumns
+from mlbatch.types import Scan, Window, WindowColumns
 from mlbatch.units import NS_PER_MS, NS_PER_S
 
 # Sets of an instant are complete by then: approximate time waits a sweep and its tolerance.

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from operator import sub
 from typing import TypeAlias
 
 import numpy as np
 
-from mlbatch.arrays import F32Array, F64Array, U8Array
+from mlbatch.arrays import F64Array, U8Array
 from mlbatch.decode.engine import Engine
 from mlbatch.decode.groups import Source
 from mlbatch.decode.scan_buffer import ScanBuffer, by_time
@@ -21,33 +21,12 @@ from mlbatch.types import (
     RecordLayout,
     RunInfo,
     Scan,
+    Window,
     WindowColumns,
-    WindowFigures,
 )
-
-__all__ = ["Decoder", "ScanHeader", "Source", "WindowColumns"]
 
 # Counts of the points of a scan, one list per sensor, in the order of `ledger.POINT_COUNTERS`.
 PointOutcomes: TypeAlias = Sequence[Sequence[int]]
-
-
-@dataclass(slots=True)
-class ScanHeader:
-    """Fields of a scan that do not depend on its points; see `Scan`."""
-
-    index: int
-    slice: int
-    start_ns: int
-    end_ns: int
-    complete: bool
-    ready_host_ns: int
-    figures: WindowFigures = ()  # by sensor
-    edge_gap_ns: tuple[int, ...] = ()  # by sensor, widest gap at either bound
-    fill: F32Array = field(default_factory=lambda: np.zeros(0, np.float32))
-    is_partial: bool = False
-    # Times of points count from the first column of their sensor, not from `start_ns`.
-    own_times: bool = False
-    world_from_body: F64Array | None = None
 
 
 class Decoder:
@@ -62,12 +41,16 @@ class Decoder:
         only: int | None = None,
         buffers: int = 1,
         record: RecordLayout | None = None,
+        *,
+        own_times: bool = False,
     ) -> None:
         """boxes_m: (k, 6), as `Rig.exclude_boxes_m`; extras: optional arrays of the scans.
 
         only: with `--split` the index of the only sensor in `sources`; buffers: number of scans
-        whose arrays are valid at a time; record: layout of the records that the output takes.
+        whose arrays are valid at a time; record: layout of the records that the output takes;
+        own_times: times of points count from the first column of their sensor.
         """
+        self._own_times = own_times
         self._info = info
         self._only = only
         self._extras = extras
@@ -99,41 +82,34 @@ class Decoder:
         """Point counters of each sensor."""
         return self._counts
 
-    def scan(
-        self,
-        columns: WindowColumns,
-        header: ScanHeader,
-        outcomes: PointOutcomes | None = None,
-    ) -> Scan:
+    def scan(self, window: Window, outcomes: PointOutcomes | None = None) -> Scan:
         """Decode the columns of a window; the arrays are valid for as many calls as buffers.
 
         outcomes: of a scan that an output already contains: its slots are counted and not decoded,
         and the contents of its arrays are undefined.
         """
         if outcomes is not None:
-            return self._scan_without_points(columns, header, outcomes)
+            return self._scan_without_points(window, outcomes)
         self._other_buffers.append(self._buffer)
         self._buffer = self._other_buffers.popleft()
-        self._reserve(len(columns))
+        self._reserve(len(window.columns))
         before = self._written()
-        timed = _by_own_times(columns, header) if header.own_times else columns
-        points = self._engine.decode(timed, header.start_ns, 0, self._buffer)
+        timed = _by_own_times(window) if self._own_times else window.columns
+        points = self._engine.decode(timed, window.start_ns, 0, self._buffer)
         if self._info.sort == "points":
             self._sort(points)
-        return self._scan(columns, header, points, before)
+        return self._scan(window, points, before)
 
-    def _scan_without_points(
-        self, columns: WindowColumns, header: ScanHeader, outcomes: PointOutcomes
-    ) -> Scan:
+    def _scan_without_points(self, window: Window, outcomes: PointOutcomes) -> Scan:
         """Return the scan with all but its points; arrays of organized scans have their shapes."""
         if self._is_organized:
-            self._reserve(len(columns))
+            self._reserve(len(window.columns))
         counts = self.counts
         before = self._written()
         own = outcomes if self._only is None else outcomes[self._only : self._only + 1]
         for one, numbers in zip(counts, own, strict=True):
             one.add(numbers)
-        scan = self._scan(columns, header, 0, before)
+        scan = self._scan(window, 0, before)
         return replace(scan, points=sum(scan.points_per_sensor))
 
     def _reserve(self, columns: int) -> None:
@@ -161,24 +137,23 @@ class Decoder:
         others = [0] * (len(self._info.sensors) - 1)
         return [*others[: self._only], *points, *others[self._only :]]
 
-    def _scan(
-        self, columns: WindowColumns, header: ScanHeader, points: int, before: Sequence[int]
-    ) -> Scan:
+    def _scan(self, window: Window, points: int, before: Sequence[int]) -> Scan:
         """before: points of each sensor before this scan."""
+        columns = window.columns
         rows = slice(0, len(columns) if self._is_organized else points)
         buffer = self._buffer
-        figures = header.figures or (NO_COLUMNS,) * len(self._info.sensors)
+        figures = window.figures or (NO_COLUMNS,) * len(self._info.sensors)
         counts, gaps_ns, coverage, overlap, _, _ = zip(*figures, strict=True)
-        edge_gap_ns = header.edge_gap_ns or (0,) * len(counts)
+        edge_gap_ns = window.edge_gap_ns or (0,) * len(counts)
         has_column = "column" in self._extras and not self._is_organized
         return Scan(
             info=self._info,
-            index=header.index,
-            slice=header.slice,
-            start_ns=header.start_ns,
-            end_ns=header.end_ns,
-            complete=header.complete,
-            ready_host_ns=header.ready_host_ns,
+            index=window.index,
+            slice=window.slice,
+            start_ns=window.start_ns,
+            end_ns=window.end_ns,
+            complete=window.complete,
+            ready_host_ns=window.ready_host_ns,
             xyz=buffer.point[rows, ..., :3],
             intensity=buffer.point[rows, ..., 3],
             reflectivity=buffer.reflectivity[rows] if self._has_reflectivity else None,
@@ -196,9 +171,9 @@ class Decoder:
             max_gap_ns=tuple(map(max, gaps_ns, edge_gap_ns)),
             coverage=coverage,
             overlap=overlap,
-            fill=header.fill,
-            is_partial=header.is_partial,
-            world_from_body=header.world_from_body,
+            fill=window.fill,
+            is_partial=window.is_partial,
+            world_from_body=window.world_from_body,
             packed=buffer.packed_points(
                 (self._slots, len(columns)) if self._is_organized else (points,),
                 self._engine.totals,
@@ -211,8 +186,9 @@ class Decoder:
         return columns.sensor.astype(np.uint8)
 
 
-def _by_own_times(columns: WindowColumns, header: ScanHeader) -> WindowColumns:
+def _by_own_times(window: Window) -> WindowColumns:
     """Return the columns with stamps as if all sensors had begun at the start of the scan."""
-    first_ns = np.array([one.first_ns for one in header.figures])
-    stamp_ns = columns.stamp_ns - (first_ns - header.start_ns)[columns.sensor]
+    columns = window.columns
+    first_ns = np.array([one.first_ns for one in window.figures])
+    stamp_ns = columns.stamp_ns - (first_ns - window.start_ns)[columns.sensor]
     return replace(columns, stamp_ns=stamp_ns)

@@ -12,10 +12,11 @@ from typing import TYPE_CHECKING, NamedTuple, Protocol, TypeVar
 from mlbatch.batching.batcher import SLACK_NS, Batcher
 from mlbatch.batching.grid import Grid
 from mlbatch.batching.merge import ColumnMerge
-from mlbatch.batching.windows import OWN, Policy, Window
+from mlbatch.batching.windows import OWN, Policy
 from mlbatch.clocks.host_offset import remedies
 from mlbatch.clocks.timescale import common_timescale
-from mlbatch.decode.decoder import Decoder, ScanHeader, Source
+from mlbatch.decode.decoder import Decoder
+from mlbatch.decode.groups import Source
 from mlbatch.discovery.types import OUTPUT, Note
 from mlbatch.errors import NoScanError, PacketError, UsageError
 from mlbatch.pipeline import run_report
@@ -34,6 +35,7 @@ from mlbatch.types import (
     RunInfo,
     Scan,
     Topic,
+    Window,
     WindowColumns,
 )
 from mlbatch.units import NS_PER_MS, NS_PER_S, rate_text
@@ -119,8 +121,7 @@ class Conversion:
 
     info, table: None before the first window; poses: known once closed; dropped_incomplete:
     windows left out by `--drop-incomplete`; notes_before_points: number of warnings that precede
-    those about points; users, imu_users: of raw packets and of samples of IMUs, besides the run
-    itself.
+    those about points; users: of raw packets; imu_users: of samples of IMUs.
     """
 
     def __init__(self, job: Job, buffers: int = 1, progress: Progress | None = None) -> None:
@@ -160,6 +161,7 @@ class Conversion:
             paces,
             merge,
         )
+        self.users: list[PacketUser] = [self.batcher]
         self.fusion: SweepFusion | None = None
         if job.is_fused:
             # Not loaded for windows.
@@ -167,12 +169,12 @@ class Conversion:
 
             cutters = [sweep_cutter(sensor) for sensor in self.sensors]
             self.fusion = SweepFusion(job.batching, cutters, merge)
+            self.users.append(self.fusion)
         self.passthrough = Passthrough(self.sensors, job)
         self.passthrough.messages.refuse_unknown(self.session.recordings)
         self.info: RunInfo | None = None
         self.table: ScanTable | None = None
         self.dropped_incomplete = 0
-        self.users: list[PacketUser] = []
         self.notes_before_points = 0
         self._plain_decoder: Decoder | None = None
         self.deskew: Mover | None = None
@@ -181,6 +183,7 @@ class Conversion:
             from mlbatch.pipeline.deskew import mover_of
 
             self.deskew = mover_of(self)
+            self.users.append(self.deskew)
             self.imu_users.append(self.deskew)
         self.poses = PoseFigures(ONE_LIDAR if job.checks_poses else NOT_ASKED)
         self.pose_check = self._new_pose_check()
@@ -233,7 +236,7 @@ class Conversion:
             sources = [sensor.source for sensor in self.sensors]
             extras = frozenset({"column"})
             self._plain_decoder = Decoder(info, sources, self.session.boxes_m, extras)
-        return self._plain_decoder.scan(columns, ScanHeader(0, 0, start_ns, end_ns, True, 0))
+        return self._plain_decoder.scan(Window(0, 0, start_ns, end_ns, True, 0, columns))
 
     # -- the loop -----------------------------------------------------------------------------
 
@@ -262,7 +265,7 @@ class Conversion:
                     progress(self.session.position_bytes, self.session.size_bytes, scans)
                 if self.batcher.past_end and not self._awaits_poses():
                     break
-                self.session.keep_from(self._oldest_ring_indexes())
+                self.session.keep_from(self._oldest_ring_index())
         self.session.refuse_apart()
         # Step 5: end of input; no sensor is waited for.
         is_short = False
@@ -331,15 +334,11 @@ class Conversion:
                 yield scan, task.only
         self.close()
 
-    def _oldest_ring_indexes(self) -> list[int | None]:
-        """First ring index of each sensor that is still needed, to be batched or decoded."""
-        oldest = []
-        for sensor in self.sensors:
-            users = (self.batcher, self.fusion, self.deskew, self._pool, *self.users)
-            ring_indexes = (one.oldest_ring_index(sensor.index) for one in users if one is not None)
-            known = (index for index in ring_indexes if index is not None)
-            oldest.append(min(known, default=None))
-        return oldest
+    def _oldest_ring_index(self) -> int | None:
+        """First ring index that is still needed, to be batched or decoded; None: none."""
+        numbers = range(len(self.sensors))
+        oldest = (user.oldest_ring_index(number) for user in self.users for number in numbers)
+        return min((index for index in oldest if index is not None), default=None)
 
     def _is_too_incomplete(self, window: Window) -> bool:
         """True if --drop-incomplete leaves a window out; its columns are counted."""
@@ -371,24 +370,18 @@ class Conversion:
 
         def decoder(sources: Sequence[Source], only: int | None) -> Decoder:
             return Decoder(
-                info,
-                sources,
-                boxes_m,
-                job.extras,
-                only,
-                self._buffers,
-                job.record,
+                *(info, sources, boxes_m, job.extras, only, self._buffers, job.record),
+                own_times=job.batching_times == OWN,
             )
 
-        sources = [sensor.source for sensor in self.sensors]
         self._pool = DecodePool(
-            sources,
+            [sensor.source for sensor in self.sensors],
             decoder,
             workers=job.jobs,
             split=job.split,
             counts_clipped=BYTE_INTENSITY in job.extras,
-            own_times=job.batching_times == OWN,
         )
+        self.users.append(self._pool)
         return self._pool
 
     def _run_info(self) -> RunInfo:

@@ -10,10 +10,10 @@ import numpy as np
 from isal.isal_zlib import crc32
 
 from mlbatch.arrays import I64Array
-from mlbatch.batching.windows import Window
-from mlbatch.decode.decoder import Decoder, ScanHeader, Source
+from mlbatch.decode.decoder import Decoder
+from mlbatch.decode.groups import Source
 from mlbatch.reports.ledger import PointCounts
-from mlbatch.types import NO_COLUMNS, ColumnFigures, Scan, WindowColumns
+from mlbatch.types import NO_COLUMNS, ColumnFigures, Scan, Window
 from mlbatch.writers.point_layouts import clipped_points
 
 # Counts of the points of a scan, one list per sensor, in the order of `ledger.POINT_COUNTERS`.
@@ -26,10 +26,9 @@ _TAIL = 64
 
 @dataclass(slots=True)
 class DecodeTask:
-    """Columns of one scan, to be decoded."""
+    """The window of one scan, to be decoded."""
 
-    columns: WindowColumns
-    label: ScanHeader
+    window: Window
     only: int | None  # with `--split` the index of their sensor
     outcomes: Outcomes | None = None  # as in `Decoder.scan`
     is_decoded: bool = False
@@ -37,17 +36,16 @@ class DecodeTask:
     @property
     def end_ns(self) -> int:
         """End of the window."""
-        return self.label.end_ns
+        return self.window.end_ns
 
     def oldest_ring_index(self, sensor: int) -> int | None:
         """First ring index of a sensor whose pixels are still needed."""
         if self.is_decoded:
             return None
-        if self.only is None:
-            ring_index = self.columns.ring_index[self.columns.sensor == sensor]
-        else:
-            ring_index = self.columns.ring_index[: len(self.columns) if self.only == sensor else 0]
-        return int(ring_index.min()) if len(ring_index) else None
+        if self.only is not None:
+            # In the decoder of one sensor.
+            sensor = 0 if self.only == sensor else -1
+        return first_ring_index([self.window], sensor)
 
 
 class Decoded(NamedTuple):
@@ -81,7 +79,7 @@ class DecodeWorker:
         """
         decoder = self._decoders[task.only or 0]
         before = [counts.counters for counts in decoder.counts] if counts_points else []
-        scan = decoder.scan(task.columns, task.label, task.outcomes)
+        scan = decoder.scan(task.window, task.outcomes)
         task.is_decoded = True
         # A scan that the output already contains has no points, but their counts.
         if self._counts_clipped and task.outcomes is None:
@@ -117,56 +115,36 @@ class DecodePool:
         workers: int,
         split: bool,
         counts_clipped: bool = False,
-        own_times: bool = False,
     ) -> None:
-        """workers: one per thread.
-
-        own_times: times of points count from the first column of their sensor.
-        """
+        """workers: one per thread."""
         self._rings = [source.ring for source in sources]
         self._split = split
-        self._own_times = own_times
         self._open: list[DecodeTask] = []
         self.workers = [DecodeWorker(sources, split, new, counts_clipped) for _ in range(workers)]
 
     def tasks(self, window: Window) -> Iterator[DecodeTask]:
         """Yield the tasks of a window: one, or with `--split` one for each sensor in it."""
-        label = ScanHeader(
-            window.index,
-            window.slice,
-            window.start_ns,
-            window.end_ns,
-            window.complete,
-            window.ready_host_ns,
-            window.figures,
-            window.edge_gap_ns,
-            window.fill,
-            window.is_partial,
-            own_times=self._own_times,
-            world_from_body=window.world_from_body,
-        )
-        columns = window.columns
         if not self._split:
-            yield self._task(columns, label, None)
+            yield self._task(window, None)
             return
         for number, figures in enumerate(window.figures):
             if not figures.columns:
                 continue
-            part = columns.take(np.flatnonzero(columns.sensor == number))
+            part = window.columns.take(np.flatnonzero(window.columns.sensor == number))
             # In the decoder of one sensor.
             part.sensor[:] = 0
             alone: list[ColumnFigures] = [NO_COLUMNS] * len(window.figures)
             alone[number] = figures
-            yield self._task(part, replace(label, figures=alone), number)
+            yield self._task(replace(window, columns=part, figures=alone), number)
 
-    def _task(self, columns: WindowColumns, label: ScanHeader, only: int | None) -> DecodeTask:
-        task = DecodeTask(columns, label, only)
+    def _task(self, window: Window, only: int | None) -> DecodeTask:
+        task = DecodeTask(window, only)
         self._open.append(task)
         return task
 
     def content(self, task: DecodeTask, before: int) -> int:
         """Checksum of a task's timestamps, of all packets up to its last, and of `before`."""
-        columns = task.columns
+        columns = task.window.columns
         content = crc32(np.ascontiguousarray(columns.stamp_ns).view(np.uint8).data, before)
         for sensor, ring in enumerate(self._rings):
             if task.only is None:

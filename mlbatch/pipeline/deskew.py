@@ -16,7 +16,6 @@ import numpy as np
 
 from mlbatch.arrays import F64Array, I64Array
 from mlbatch.batching.grid import Grid
-from mlbatch.batching.windows import Window
 from mlbatch.motion.estimate import Estimate, VelocityEstimator
 from mlbatch.motion.registration import ORIGIN, ColumnCloud
 from mlbatch.motion.track import PoseLine, PoseTrack
@@ -25,7 +24,7 @@ from mlbatch.pipeline.decode_pool import first_ring_index
 from mlbatch.pipeline.imu_poses import IMU, ImuPoses, PoseSource
 from mlbatch.pipeline.rotation_check import RotationCheck
 from mlbatch.reports.motion import MotionLedger, VelocityCounts
-from mlbatch.types import ImuSamples, Message, Scan, WindowColumns, instant_ns
+from mlbatch.types import ImuSamples, Message, Scan, Window, WindowColumns, instant_ns
 from mlbatch.units import NS_PER_S
 
 if TYPE_CHECKING:

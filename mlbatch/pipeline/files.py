@@ -371,7 +371,7 @@ class Files:
             return None
         self.content = self.run.pool.content(task, self.content)
         self.total += 1
-        place = (task.label.index, task.label.slice, task.only)
+        place = (task.window.index, task.window.slice, task.only)
         if self.is_due(*place):
             self._contents.append(self.content)
             return None

@@ -16,11 +16,10 @@ from mlbatch.arrays import F64Array, I64Array
 from mlbatch.frames.transforms import from_rpy_deg
 from mlbatch.pipeline.sensor import Sensor
 from mlbatch.reports.poses import PoseFigures
-from mlbatch.types import Scan, WindowColumns
+from mlbatch.types import Scan, Window, WindowColumns
 from mlbatch.units import NS_PER_S
 
 if TYPE_CHECKING:
-    from mlbatch.batching.windows import Window
     from mlbatch.poses.check import Begun, PoseComparison
     from mlbatch.poses.solve import Cloud
 

@@ -16,10 +16,10 @@ from mlbatch.motion.agreement import FEW_WINDOWS, LITTLE_ROTATION, Agreement, Tu
 from mlbatch.motion.estimate import VelocityEstimator
 from mlbatch.motion.track import PoseLine
 from mlbatch.reports.motion import RotationFigures
+from mlbatch.types import Window
 from mlbatch.units import NS_PER_S
 
 if TYPE_CHECKING:
-    from mlbatch.batching.windows import Window
     from mlbatch.pipeline.deskew import WindowPoints
 
 # Windows that are compared, and that are registered for it at most.

@@ -146,7 +146,7 @@ class _Output:
             self._idle,
             self._files,
             kept=kept,
-            index=None if following is None else following.label.index,
+            index=None if following is None else following.window.index,
         )
 
     def _begin(self) -> None:

@@ -153,10 +153,9 @@ class Session:
 
     # -- reading ------------------------------------------------------------------------------
 
-    def keep_from(self, oldest_ring_indexes: Sequence[int | None]) -> None:
-        """Free all packets before the first one needed, by sensor; None: none is needed."""
-        needed = [index for index in oldest_ring_indexes if index is not None]
-        self._arena.keep_from(min(needed, default=None))
+    def keep_from(self, ring_index: int | None) -> None:
+        """Free all packets before the first one needed; None: none is needed."""
+        self._arena.keep_from(ring_index)
 
     def packets(self) -> Generator[PacketBatch, None, None]:
         """Yield all packets in receive order, with injected faults."""

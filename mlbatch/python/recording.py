@@ -310,7 +310,7 @@ class Recording:
         offset_ns = session.sensors[number].clock.imu_offset_ns
         with contextlib.closing(session.packets()) as batches:
             for batch in batches:
-                session.keep_from(())
+                session.keep_from(None)
                 for samples in ingest.columns(batch).imu:
                     if samples.sensor == number and len(samples.stamp_ns):
                         samples.stamp_ns = samples.stamp_ns + offset_ns

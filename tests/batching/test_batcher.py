@@ -15,8 +15,9 @@ import pytest
 from mlbatch.batching.batcher import Batcher
 from mlbatch.batching.grid import Grid
 from mlbatch.batching.intake import Accepted, Intake
-from mlbatch.batching.windows import Limit, Policy, Window
+from mlbatch.batching.windows import Limit, Policy
 from mlbatch.errors import ClockError, ClockJump
+from mlbatch.types import Window
 from tests.builders.arrivals import accepted_by, arrival_of
 from tests.builders.hand import MS, packet
 from tests.reference.intake import FeedPacket

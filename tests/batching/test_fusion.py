@@ -9,9 +9,9 @@ from mlbatch.arrays import I64Array
 from mlbatch.batching.fusion import POLICIES, SweepFusion
 from mlbatch.batching.merge import ColumnMerge
 from mlbatch.batching.sweeps import SweepCutter
-from mlbatch.batching.windows import WINDOW, Window
+from mlbatch.batching.windows import WINDOW
 from mlbatch.options import BATCHINGS
-from mlbatch.types import NO_COLUMNS, WindowColumns
+from mlbatch.types import NO_COLUMNS, Window, WindowColumns
 from mlbatch.units import NS_PER_MS
 
 TICKS = 10

@@ -36,8 +36,8 @@ class Driver:
     def push(self, batch: PacketBatch) -> int:
         """Push a batch, decode the windows it completes; returns the number of scans."""
         batcher = self.run.batcher
-        oldest = [batcher.oldest_ring_index(sensor.index) for sensor in self.run.sensors]
-        self.run.session.keep_from(oldest)
+        oldest = (batcher.oldest_ring_index(sensor.index) for sensor in self.run.sensors)
+        self.run.session.keep_from(min((one for one in oldest if one is not None), default=None))
         ingested = self.run.session.ingest.columns(batch)
         scans = 0
         for window in batcher.push(ingested.accepted, batch.host_ns):

@@ -9,13 +9,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from mlbatch.arrays import F32Array, F64Array, I64Array, U8Array, U16Array
-from mlbatch.decode.decoder import Decoder, ScanHeader, WindowColumns
+from mlbatch.decode.decoder import Decoder
 from mlbatch.decode.groups import Source, slot_numbers
 from mlbatch.lidar.geometry import BeamTable, Projection
 from mlbatch.lidar.interface import BitField, ChannelRun, Lidar, PixelTable, Records, ReturnLayout
 from mlbatch.native.arena import PacketArena
 from mlbatch.pipeline.sensor import new_ring
-from mlbatch.types import EXTRAS, ColumnHeaders, RunInfo, SensorInfo
+from mlbatch.types import EXTRAS, ColumnHeaders, RunInfo, SensorInfo, Window, WindowColumns
 
 _NO_BOXES = np.empty((0, 6))
 
@@ -70,7 +70,7 @@ def readings(
         headers.encoder.reshape(-1) if encoder is None else encoder,
     )
     decoder = Decoder(info, [source], _NO_BOXES, EXTRAS)
-    scan = decoder.scan(columns, ScanHeader(0, 0, 0, 1_000_000_000, True, 0))
+    scan = decoder.scan(Window(0, 0, 0, 1_000_000_000, True, 0, columns))
     shape = (count, lidar.channels, lidar.returns)
     slots = slot_numbers(lidar)
 

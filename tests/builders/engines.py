@@ -8,13 +8,13 @@ from dataclasses import fields, replace
 import numpy as np
 
 from mlbatch.arrays import F64Array
-from mlbatch.decode.decoder import Decoder, ScanHeader, WindowColumns
+from mlbatch.decode.decoder import Decoder
 from mlbatch.decode.groups import Source
 from mlbatch.native.arena import PacketArena
 from mlbatch.pipeline.conversion import Conversion, SkippedWindow
 from mlbatch.pipeline.job import Job
 from mlbatch.pipeline.sensor import sensors_of
-from mlbatch.types import EXTRAS, RunInfo, Scan
+from mlbatch.types import EXTRAS, RunInfo, Scan, Window
 from mlbatch.units import rate_text
 from tests.reference.decoder import LiteralDecoder, check_scan
 
@@ -49,10 +49,10 @@ class Pair:
         self.decoder = Decoder(info, sources, boxes_m, extras)
         self.literal = LiteralDecoder(sources, np.asarray(boxes_m).reshape(-1, 6))
 
-    def check(self, due: WindowColumns, label: ScanHeader) -> Scan:
+    def check(self, window: Window) -> Scan:
         """Decode a window; the scan, and the counts so far, are what the columns say."""
-        scan = self.decoder.scan(due, label)
-        check_scan(self.literal, due, scan, label.start_ns)
+        scan = self.decoder.scan(window)
+        check_scan(self.literal, window.columns, scan, window.start_ns)
         for counts, expected in zip(self.decoder.counts, self.literal.counts, strict=True):
             for name in ("slots", "no_return", "repeated", "range", "box", "written"):
                 assert getattr(counts, name) == expected[name], name
@@ -80,10 +80,10 @@ def check_conversion(job: Job, wanted: Sequence[Job] = WANTED) -> list[Pair]:
         if isinstance(task, SkippedWindow):
             continue
         pairs = pairs or [_pair(run, one) for one in wanted]
-        columns = task.columns
+        columns = task.window.columns
         for pair in pairs:
             few = rng.permutation(len(columns))[:MOST_COLUMNS]
-            pair.check(columns.take(np.sort(few)), task.label)
+            pair.check(replace(task.window, columns=columns.take(np.sort(few))))
         task.is_decoded = True
     return pairs
 

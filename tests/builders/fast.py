@@ -11,7 +11,7 @@ from mlbatch.batching.batcher import Batcher
 from mlbatch.batching.grid import Grid
 from mlbatch.batching.intake import Accepted, Arrival, Intake
 from mlbatch.batching.windows import Limit, Policy
-from mlbatch.batching.windows import Window as FastWindow
+from mlbatch.types import Window as FastWindow
 from tests.builders.arrivals import WIDEST, accepted_by, arrival_of
 from tests.reference.batching import FeedPacket, Outcome, Settings, Window
 

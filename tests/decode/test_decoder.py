@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 
 from mlbatch.arrays import F64Array
-from mlbatch.decode.decoder import Decoder, ScanHeader, WindowColumns
+from mlbatch.decode.decoder import Decoder
 from mlbatch.decode.groups import Source
 from mlbatch.frames.transforms import from_rpy_deg
 from mlbatch.native.arena import PacketArena
 from mlbatch.pipeline.sensor import new_ring
 from mlbatch.simulate.ouster.encode import OusterSpec, encode_packets
-from mlbatch.types import RunInfo, SensorInfo
+from mlbatch.types import RunInfo, SensorInfo, Window, WindowColumns
 from tests.builders.decoded import Readings, readings
 from tests.builders.others import rows
 from tests.builders.run import FIXTURE, in_memory
@@ -92,7 +92,7 @@ def test_windows_without_a_column_or_a_return_have_no_points(columns: int, layou
     nothing = np.zeros(columns, np.int64)
     due = WindowColumns(nothing, nothing, places, nothing)
     decoder = Decoder(info, [Source(lidar, ring, np.eye(4), 0)], np.empty((0, 6)))
-    scan = decoder.scan(due, ScanHeader(3, 0, 0, 10**8, True, 17))
+    scan = decoder.scan(Window(3, 0, 0, 10**8, True, 17, due))
     assert (scan.points, len(scan.column_stamp_ns)) == (0, columns)
     assert len(scan.xyz) == (columns if layout == "organized" else 0)
 

@@ -19,7 +19,7 @@ from hypothesis import strategies as st
 from mlbatch.arrays import I64Array
 from mlbatch.decode import decoder as decode
 from mlbatch.decode import engine
-from mlbatch.decode.decoder import Decoder, ScanHeader, WindowColumns
+from mlbatch.decode.decoder import Decoder
 from mlbatch.decode.groups import Source
 from mlbatch.decode.packet_ring import PacketRing
 from mlbatch.decode.scan_buffer import LABEL, ScanBuffer
@@ -33,7 +33,7 @@ from mlbatch.pipeline.sensor import new_ring
 from mlbatch.sensors.ouster.profiles import PROFILES
 from mlbatch.simulate.ouster.encode import OusterSpec
 from mlbatch.simulate.spinning import SpinningSpec
-from mlbatch.types import EXTRAS, RecordLayout, RunInfo, SensorInfo
+from mlbatch.types import EXTRAS, RecordLayout, RunInfo, SensorInfo, Window, WindowColumns
 from mlbatch.writers.las_encoder import RECORD as LAS
 from mlbatch.writers.point_layouts import (
     CLOUD_LAYOUTS,
@@ -52,7 +52,13 @@ from tests.reference.records import check_records
 
 START_NS = 1_800_000_000_000_000_000
 END_NS = 1_800_000_000_100_000_000
-HEADER = ScanHeader(0, 0, START_NS, END_NS, True, 0)
+
+
+def window_of(columns: WindowColumns) -> Window:
+    """A window with these columns."""
+    return Window(0, 0, START_NS, END_NS, True, 0, columns)
+
+
 # Tilted, level, where the vehicle is, and upside down, with zeros of both signs: sensors that are
 # decoded together differ in these.
 POSES = (
@@ -196,16 +202,16 @@ class Packing:
             Decoder(info, sources, boxes_m, extras, record=chosen) for chosen in (None, record)
         )
 
-    def check(self, columns: WindowColumns, header: ScanHeader) -> None:
+    def check(self, window: Window) -> None:
         """Decode a window by both."""
-        scan = self._arrays.scan(columns, header)
-        found = self._records.scan(columns, header)
+        scan = self._arrays.scan(window)
+        found = self._records.scan(window)
         assert scan.packed is None
         assert found.packed is not None
         packed = found.packed
         assert packed.shape == scan.time_ns.T.shape
         records = packed.buffer[packed.begin : packed.end].tobytes()
-        check_records(records, scan, self._name, seed=len(columns))
+        check_records(records, scan, self._name, seed=len(window.columns))
         assert self._arrays.counts == self._records.counts
         if packed.totals is not None and scan.points:
             assert packed.totals.low_m == tuple(scan.xyz.min(axis=0).tolist())
@@ -260,8 +266,8 @@ def check(lidars: list[Lidar], case: Case) -> None:
     for _ in range(2):
         columns = drawn.columns()
         few = np.sort(rng.permutation(case.columns)[:MOST_COLUMNS])
-        pair.check(columns.take(few), HEADER)
-        packing.check(columns, HEADER)
+        pair.check(window_of(columns.take(few)))
+        packing.check(window_of(columns))
 
 
 # Lanes of the baseline of a processor, and another compiler, where it is installed.
@@ -288,7 +294,7 @@ def test_all_builds_give_the_same_bytes(
         decoders = [Decoder(drawn.info, drawn.sources, drawn.boxes_m, extras) for _ in range(2)]
         cast(Any, decoders[1])._engine._library = other
         for due in (columns, replace(columns, moves=moves)):
-            ours, theirs = (decoder.scan(due, HEADER) for decoder in decoders)
+            ours, theirs = (decoder.scan(window_of(due)) for decoder in decoders)
             assert ours.points > 0
             assert_same(ours, theirs)
         assert decoders[0].counts == decoders[1].counts
@@ -337,8 +343,7 @@ def test_terms_of_zero_keep_the_signs_of_zeros(
     run = RunInfo((info,), "base_link", "10", "utc", 1, layout)
     stamp_ns = np.full(len(places), START_NS)
     due = WindowColumns(stamp_ns, np.zeros(len(places), np.int64), places, word)
-    header = ScanHeader(0, 0, START_NS, END_NS, True, 0)
-    xyz = Decoder(run, [source], np.empty((0, 6)), extras).scan(due, header).xyz
+    xyz = Decoder(run, [source], np.empty((0, 6)), extras).scan(window_of(due)).xyz
     is_point = ranges_m > 0
     found = xyz[: len(places)][is_point] if layout == "organized" else xyz
     assert is_point.any()
@@ -371,12 +376,12 @@ def test_sensors_of_one_model_are_decoded_together(chosen: list[int], others: li
 def alone(drawn: Drawn) -> None:
     """Each sensor has the points, bit by bit, that it has alone."""
     columns = drawn.columns()
-    together = Decoder(drawn.info, drawn.sources, drawn.boxes_m).scan(columns, HEADER)
+    together = Decoder(drawn.info, drawn.sources, drawn.boxes_m).scan(window_of(columns))
     for number, source in enumerate(drawn.sources):
         own = columns.take(np.flatnonzero(columns.sensor == number))
         one = replace(own, sensor=np.zeros(len(own), np.int64))
         decoder = Decoder(drawn.info, [source], drawn.boxes_m, only=number)
-        scan = decoder.scan(one, HEADER)
+        scan = decoder.scan(window_of(one))
         is_organized = scan.info.layout == "organized"
         is_own = columns.sensor == number if is_organized else together.lidar_id == number
         assert scan.points > 0
@@ -444,7 +449,7 @@ def test_records_stay_while_the_loops_run() -> None:
     stamp_ns = np.full(len(places), START_NS)
     nothing = np.zeros(len(places), np.int64)
     due = WindowColumns(stamp_ns, nothing, places, nothing)
-    assert decoder.scan(due, ScanHeader(0, 0, START_NS, END_NS, True, 0)).points > 0
+    assert decoder.scan(window_of(due)).points > 0
     assert grown == [True]
 
 

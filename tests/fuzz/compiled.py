@@ -17,7 +17,6 @@ import numpy as np
 
 from mlbatch.arrays import U8Array
 from mlbatch.batching.merge import ColumnMerge
-from mlbatch.decode.decoder import ScanHeader
 from mlbatch.decode.groups import Source
 from mlbatch.decode.packet_ring import PacketRing
 from mlbatch.lidar.headers import content_keys, hash_factors
@@ -38,6 +37,7 @@ from mlbatch.types import (
     RunInfo,
     SensorInfo,
     StreamTable,
+    Window,
     WindowColumns,
 )
 from tests.builders.captures import udp_frame
@@ -140,7 +140,7 @@ def _decode(data: bytes, folder: Path) -> None:
     stamp_ns = np.sort(rng.integers(START_NS, END_NS, _COLUMNS))
     moves = rng.normal(size=(_COLUMNS, 3, 4)).astype(np.float32) if rng.random() < 0.3 else None
     columns = WindowColumns(stamp_ns, np.zeros(_COLUMNS, np.int64), place, word, moves)
-    pair.check(columns, ScanHeader(0, 0, START_NS, END_NS, True, 0))
+    pair.check(Window(0, 0, START_NS, END_NS, True, 0, columns))
 
 
 # -- headers --------------------------------------------------------------------------------------
