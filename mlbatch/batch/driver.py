@@ -17,7 +17,7 @@ from datetime import datetime, timezone
 from functools import partial
 from pathlib import Path
 from queue import SimpleQueue
-from typing import Any, Protocol
+from typing import Any
 
 from mlbatch.batch.record import FAILED, SessionRecord
 from mlbatch.batch.status import SessionStatus
@@ -43,18 +43,6 @@ Progress = Callable[[SessionStatus], None]
 # DiskFullError ends all sessions.
 Outcome = SessionStatus | DiskFullError
 Ended = Callable[[Outcome], None]
-
-
-class Executor(Protocol):
-    """Runs sessions; at_once: how many it is given."""
-
-    at_once: int
-
-    def begin(self, task: Task, ended: Ended) -> None:
-        """Begin a session; `ended` is called from another thread."""
-
-    def close(self) -> None:
-        """End the sessions that run in order: their outputs can be resumed."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -117,7 +105,7 @@ class Batch:
 
     def _run(self, waiting: deque[Task], found: dict[str, SessionStatus]) -> None:
         """Run sessions. A simple queue, since an interrupt may leave a lock of Python's taken."""
-        executor: Executor = Threads(self.workers)
+        executor: Threads | Dask = Threads(self.workers)
         if self.scheduler:
             # All at once, so that workers that join later get some; else one per thread.
             executor = Dask(self.scheduler, None if self.fail_fast else len(waiting))
@@ -178,7 +166,7 @@ def _outcome(task: Task, run: Callable[[], SessionRecord]) -> Outcome:
 
 
 class Threads:
-    """A thread for each session, which waits for its process."""
+    """A thread for each session, which waits for its process; at_once: how many it is given."""
 
     def __init__(self, at_once: int) -> None:
         self.at_once = at_once
@@ -186,7 +174,7 @@ class Threads:
         self._threads: list[threading.Thread] = []
 
     def begin(self, task: Task, ended: Ended) -> None:
-        """Begin a session."""
+        """Begin a session; `ended` is called from another thread."""
 
         def work() -> None:
             ended(_outcome(task, partial(run_session, task, self._stop)))

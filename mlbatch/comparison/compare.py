@@ -261,7 +261,7 @@ def compare(
 
         names = [*(policy.name for policy in policies), WINDOWS]
         finder = InstantFinder(names, run.sensors, period_ns, run.plain_scan)
-        run.users.append(finder)
+        run.users.append(finder.oldest_ring_index)
     cutters = [sweep_cutter(sensor) for sensor in run.sensors]
     joiner = Joiner(cutters, policies, period_ns, finder)
     windows = SetStatistics(WINDOWS, count, period_ns)

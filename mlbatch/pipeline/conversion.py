@@ -7,7 +7,7 @@ import math
 import time
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, NamedTuple, Protocol, TypeVar
+from typing import TYPE_CHECKING, NamedTuple, TypeVar
 
 from mlbatch.batching.batcher import SLACK_NS, Batcher
 from mlbatch.batching.grid import Grid
@@ -49,6 +49,10 @@ if TYPE_CHECKING:
 # Called with the bytes read so far, the bytes of all recordings, and the scans so far.
 Progress = Callable[[int, int, int], None]
 Item = TypeVar("Item")
+# First ring index of a sensor that is still needed, to be batched or decoded; None: none.
+PacketUser = Callable[[int], int | None]
+# Takes samples of IMUs and messages, as they are read.
+ImuUser = Callable[[Iterable[ImuSamples], Iterable[Message]], None]
 # Timescales on which messages of an IMU are comparable with scans.
 _EPOCH_SCALES = ("utc", "tai")
 
@@ -92,22 +96,6 @@ class Stages:
             finally:
                 setattr(self, stage, getattr(self, stage) + time.perf_counter() - began_s)
             yield item
-
-
-class PacketUser(Protocol):
-    """A stage that decodes columns of windows while the main loop continues."""
-
-    def oldest_ring_index(self, sensor: int) -> int | None:
-        """First ring index of a sensor that is still needed; None: none."""
-        ...
-
-
-class ImuUser(Protocol):
-    """Takes samples of IMUs and messages, as they are read."""
-
-    def add(self, imu: Iterable[ImuSamples], messages: Iterable[Message]) -> None:
-        """Take those of a batch."""
-        ...
 
 
 class SkippedWindow(NamedTuple):
@@ -161,7 +149,7 @@ class Conversion:
             paces,
             merge,
         )
-        self.users: list[PacketUser] = [self.batcher]
+        self.users: list[PacketUser] = [self.batcher.oldest_ring_index]
         self.fusion: SweepFusion | None = None
         if job.is_fused:
             # Not loaded for windows.
@@ -169,7 +157,7 @@ class Conversion:
 
             cutters = [sweep_cutter(sensor) for sensor in self.sensors]
             self.fusion = SweepFusion(job.batching, cutters, merge)
-            self.users.append(self.fusion)
+            self.users.append(self.fusion.oldest_ring_index)
         self.passthrough = Passthrough(self.sensors, job)
         self.passthrough.messages.refuse_unknown(self.session.recordings)
         self.info: RunInfo | None = None
@@ -183,8 +171,8 @@ class Conversion:
             from mlbatch.pipeline.deskew import mover_of
 
             self.deskew = mover_of(self)
-            self.users.append(self.deskew)
-            self.imu_users.append(self.deskew)
+            self.users.append(self.deskew.oldest_ring_index)
+            self.imu_users.append(self.deskew.add)
         self.poses = PoseFigures(ONE_LIDAR if job.checks_poses else NOT_ASKED)
         self.pose_check = self._new_pose_check()
         self._buffers = buffers
@@ -255,7 +243,7 @@ class Conversion:
                 # Steps 1 and 2: the sensor of each packet, the timestamps of its columns.
                 ingested = self.session.ingest.columns(batch)
                 for user in self.imu_users:
-                    user.add(ingested.imu, batch.messages)
+                    user(ingested.imu, batch.messages)
                 self.passthrough.add(ingested.imu, batch.messages, self.batcher.limits_ns)
                 self._refuse_rejected()
                 # Steps 3 and 4: columns by timestamp; windows close behind the watermark.
@@ -335,9 +323,9 @@ class Conversion:
         self.close()
 
     def _oldest_ring_index(self) -> int | None:
-        """First ring index that is still needed, to be batched or decoded; None: none."""
+        """First ring index of any sensor that is still needed; None: none."""
         numbers = range(len(self.sensors))
-        oldest = (user.oldest_ring_index(number) for user in self.users for number in numbers)
+        oldest = (user(number) for user in self.users for number in numbers)
         return min((index for index in oldest if index is not None), default=None)
 
     def _is_too_incomplete(self, window: Window) -> bool:
@@ -381,7 +369,7 @@ class Conversion:
             split=job.split,
             counts_clipped=BYTE_INTENSITY in job.extras,
         )
-        self.users.append(self._pool)
+        self.users.append(self._pool.oldest_ring_index)
         return self._pool
 
     def _run_info(self) -> RunInfo:

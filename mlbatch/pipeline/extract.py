@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import os
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from fnmatch import fnmatchcase
@@ -70,37 +70,30 @@ class Extraction:
     overwrite: bool = False
 
 
-@dataclass(frozen=True, slots=True)
-class ExtractedLidar:
-    """Packets of a lidar; place: address and port, or topic, of its own packets."""
-
-    name: str
-    model: str
-    place: str
-    read: int
-    written: int
-
-
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class Extracted:
     """Result: read = written + sum(left_out), packets by REASONS.
 
-    messages: copied, without packets; first_ns, last_ns: receive times of what was written; files:
-    the recording first; frames: those without a packet, by reason; is_short: the recording has
+    files: the recording first; messages: copied, without packets; first_ns, last_ns: receive times
+    of what was written; frames: those without a packet, by reason; is_short: the recording has
     more, which was not read; notes: warnings.
     """
 
-    lidars: tuple[ExtractedLidar, ...]
-    read: int
-    written: int
-    left_out: dict[str, int]
-    messages: int
-    first_ns: int
-    last_ns: int
+    lidars: Sequence[ChosenLidar]
     files: tuple[Path, ...]
-    frames: dict[str, int]
-    is_short: bool
-    notes: tuple[str, ...]
+    read: int = 0
+    left_out: dict[str, int] = field(default_factory=lambda: dict.fromkeys(REASONS, 0))
+    messages: int = 0
+    first_ns: int = 0
+    last_ns: int = 0
+    frames: Counter[str] = field(default_factory=Counter)
+    is_short: bool = False
+    notes: list[str] = field(default_factory=list)
+
+    @property
+    def written(self) -> int:
+        """Packets that were written."""
+        return sum(lidar.written for lidar in self.lidars)
 
     def rows(self) -> list[tuple[str, ...]]:
         """A table of the lidars, head first."""
@@ -154,7 +147,7 @@ def extract(request: Extraction, progress: Callable[[int, int], object] | None =
         with export_errors(target):
             for output in outputs[1:]:
                 output.partial.write_bytes(texts[output.target])
-            run = _Run(setup, places, request, topics, outputs[0].partial)
+            run = _Run(setup, places, request, topics, outputs[0].partial, tuple(paths))
             run.write(progress)
         # The recording last: with it the others are complete.
         for output in (*outputs[1:], outputs[0]):
@@ -163,7 +156,7 @@ def extract(request: Extraction, progress: Callable[[int, int], object] | None =
         for output in outputs:
             discard(output.target)
         raise
-    return run.result(paths)
+    return run.found
 
 
 def _check_target(request: Extraction) -> None:
@@ -238,7 +231,7 @@ def _forwarded(
 
 
 class _Run:
-    """Writes the recording."""
+    """Writes the recording; found: counts so far, complete once it is written."""
 
     def __init__(
         self,
@@ -247,7 +240,9 @@ class _Run:
         request: Extraction,
         topics: frozenset[Topic],
         path: Path,
+        files: tuple[Path, ...],
     ) -> None:
+        self.found = Extracted(places.lidars, files)
         self._setup = setup
         self._places = places
         self._topics = topics
@@ -255,12 +250,8 @@ class _Run:
         suffix = request.output.suffix
         self._pcap = PcapFile(path) if suffix == PCAP else None
         self._bag: Bag | None = None if suffix == PCAP else new_bag(path, suffix)
-        self._read = 0
-        self._left_out = dict.fromkeys(REASONS, 0)
         # Of REASONS the last, by stream and size.
-        self._without_place: dict[tuple[int, int], int] = {}
-        self._messages = 0
-        self._is_short = False
+        self._without_place = Counter[tuple[int, int]]()
         # Received, by the recording; written.
         self._received_ns: tuple[int, int] | None = None
         self._written_ns: tuple[int, int] | None = None
@@ -291,6 +282,7 @@ class _Run:
             raise
         self._close()
         self._refuse_nothing()
+        self._complete()
 
     def _close(self) -> None:
         for file in (self._pcap, self._bag):
@@ -303,7 +295,7 @@ class _Run:
         with contextlib.closing(self._setup.first.whole(is_without_packets)) as batches:
             for batch in batches:
                 if self._is_beyond(batch):
-                    self._is_short = True
+                    self.found.is_short = True
                     return
                 self._add_messages(batch.messages)
                 self._add(batch)
@@ -320,21 +312,22 @@ class _Run:
         if not len(batch):
             self._forward_until(None)
             return
-        self._read += len(batch)
+        self.found.read += len(batch)
         first_ns, last_ns = self._received_ns or (int(batch.host_ns.min()), 0)
         self._received_ns = first_ns, max(last_ns, int(batch.host_ns.max()))
         assigned = self._places.assign(batch)
         is_chosen = assigned.place >= 0
         for number, count in enumerate(np.bincount(assigned.lidar[is_chosen]).tolist()):
             self._places.lidars[number].read += count
-        self._left_out["not_chosen"] += len(batch) - int(is_chosen.sum())
+        left_out = self.found.left_out
+        left_out["not_chosen"] += len(batch) - int(is_chosen.sum())
         is_inside = np.ones(len(batch), np.bool_)
         if self._begin_ns is not None:
             is_inside &= batch.host_ns >= self._begin_ns
         if self._end_ns is not None:
             is_inside &= batch.host_ns < self._end_ns
         outside = np.flatnonzero(is_chosen & ~is_inside)
-        self._left_out["outside_time"] += len(outside)
+        left_out["outside_time"] += len(outside)
         self._keep_early(batch, assigned, outside)
         rows = np.flatnonzero(is_chosen & is_inside)
         if len(rows):
@@ -361,7 +354,7 @@ class _Run:
             return
         found = sorted(self._early.items(), key=lambda item: item[1][1].host_ns)
         self._early = {}
-        self._left_out["outside_time"] -= len(found)
+        self.found.left_out["outside_time"] -= len(found)
         size = np.array([key[1] for key, _ in found])
         data = b"".join(packet.payload for _, (_, packet) in found) + bytes(SLACK)
         place = np.array([key[0] for key, _ in found])
@@ -383,9 +376,8 @@ class _Run:
         else:
             is_written = np.array(list(self._put_messages(batch, place)), np.bool_)
         for row in np.flatnonzero(~is_written).tolist():
-            kind = int(batch.stream[row]), int(batch.size[row])
-            self._without_place[kind] = self._without_place.get(kind, 0) + 1
-        self._left_out["no_place"] += len(batch) - int(is_written.sum())
+            self._without_place[int(batch.stream[row]), int(batch.size[row])] += 1
+        self.found.left_out["no_place"] += len(batch) - int(is_written.sum())
         if not is_written.any():
             return
         for number, count in enumerate(np.bincount(lidar[is_written]).tolist()):
@@ -457,7 +449,7 @@ class _Run:
             message = self._waiting.popleft()
             if self._bag is not None:
                 self._bag.forward(message)
-                self._messages += 1
+                self.found.messages += 1
 
     # -- result -------------------------------------------------------------------------------
 
@@ -471,52 +463,34 @@ class _Run:
             f"received {text_of_range(*self._received_ns)}"
         )
 
-    def result(self, files: Sequence[Path]) -> Extracted:
-        """Counts and notes."""
-        places = self._places
-        frames: dict[str, int] = {}
-        notes = []
+    def _complete(self) -> None:
+        """Complete the counts, and add notes."""
+        found, table, is_capture = self.found, self._setup.sampler.table, self._pcap is not None
         for recording in self._setup.recordings:
-            notes += [f"{recording.path.name}: {note}" for note in recording.notes]
-            for reason, count in recording.counts.skipped.items():
-                frames[reason] = frames.get(reason, 0) + count
+            found.notes += [f"{recording.path.name}: {note}" for note in recording.notes]
+            found.frames.update(recording.counts.skipped)
+        why = "" if is_capture else ": no message of drivers contains them"
         for (stream, size), count in self._without_place.items():
-            source = self._setup.sampler.table.streams[stream]
-            notes.append(
-                f"{source}: {files[0].name} has no place for {count} packets of {size} bytes: no "
-                "message of drivers contains them"
-                if self._bag is not None
-                else f"{source}: {files[0].name} has no place for {count} packets of {size} bytes"
+            found.notes.append(
+                f"{table.streams[stream]}: {found.files[0].name} has no place for {count} packets "
+                f"of {size} bytes{why}"
             )
-        for stream in sorted({place.stream for place in places.places if self._pcap is not None}):
-            if stream in self._setup.sampler.table.untimed:
-                notes.append(
-                    f"{self._setup.sampler.table.streams[stream]}: expected the receive time of "
-                    "each packet, found only that of whole messages, which all their packets got; "
-                    "do not convert with --clock host"
-                )
-        bare = [lidar.name for lidar in places.lidars if lidar.sensor is None and lidar.written]
+        streams = {place.stream for place in self._places.places} if is_capture else set()
+        for stream in sorted(streams & table.untimed):
+            found.notes.append(
+                f"{table.streams[stream]}: expected the receive time of each packet, found only "
+                "that of whole messages, which all their packets got; do not convert with --clock "
+                "host"
+            )
+        bare = [lidar.name for lidar in found.lidars if lidar.sensor is None and lidar.written]
         if bare:
-            notes.append(f"no calibration of {some(bare, len(bare))} was found: add it to convert")
-        first_ns, last_ns = self._written_ns or (0, 0)
-        lidars = []
-        for number, lidar in enumerate(places.lidars):
-            main = places.main_place(number)
-            to = "" if main is None else str(main.to)
-            lidars.append(ExtractedLidar(lidar.name, lidar.model, to, lidar.read, lidar.written))
-        return Extracted(
-            tuple(lidars),
-            self._read,
-            sum(lidar.written for lidar in lidars),
-            {reason: count for reason, count in self._left_out.items() if count},
-            self._messages,
-            first_ns,
-            last_ns,
-            tuple(files),
-            frames,
-            self._is_short,
-            tuple(notes),
-        )
+            names = some(bare, len(bare))
+            found.notes.append(f"no calibration of {names} was found: add it to convert")
+        found.first_ns, found.last_ns = self._written_ns or (0, 0)
+        found.left_out = {reason: count for reason, count in found.left_out.items() if count}
+        for number, lidar in enumerate(found.lidars):
+            main = self._places.main_place(number)
+            lidar.place = "" if main is None else str(main.to)
 
 
 def _limits(

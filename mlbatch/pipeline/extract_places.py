@@ -11,8 +11,7 @@ from __future__ import annotations
 import ipaddress
 import os
 import re
-from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from enum import Enum
 from pathlib import Path
 from typing import NamedTuple
@@ -55,7 +54,8 @@ class ChosenLidar:
     """A lidar whose packets are extracted, and how many of them.
 
     sensor: None for a lidar without calibration; kinds: its lidar packets of the first seconds;
-    recorded: how its drivers record packets, None: not known.
+    recorded: how its drivers record packets, None: not known; place: address and port, or topic, of
+    its own packets, once they are written.
     """
 
     name: str
@@ -63,6 +63,7 @@ class ChosenLidar:
     sensor: DetectedSensor | None
     kinds: set[PacketKind]
     recorded: Recorded | None = None
+    place: str = ""
     read: int = 0
     written: int = 0
 
@@ -74,7 +75,6 @@ class Place:
     to: address and port, or topic; None: the container has no place for them.
     """
 
-    number: int
     stream: int
     to: Stream | None
     messages: PacketMessages | None = None
@@ -88,7 +88,6 @@ class Assigned(NamedTuple):
     is_device: BoolArray
 
 
-@dataclass(slots=True)
 class Places:
     """Assigns packets to chosen lidars and their places; encodings: of messages, () of a capture.
 
@@ -96,21 +95,18 @@ class Places:
     calibration.
     """
 
-    setup: Discovery
-    encodings: tuple[str, ...]
-    lidars: list[ChosenLidar] = field(default_factory=list)
-    places: list[Place] = field(default_factory=list)
-    _known: dict[tuple[int, int, Use], int] = field(default_factory=dict)
-    _addresses: dict[int, str] = field(default_factory=dict)
-    # Lidar of each kind without a sensor, and of other packets near a lidar.
-    _unmatched: dict[PacketKind, int] = field(default_factory=dict)
-    _near: dict[PacketKind, int] = field(default_factory=dict)
-    _topics: Mapping[str, Topic] = field(default_factory=dict)
-    # Lidar that has a new topic.
-    _new_topics: dict[str, int] = field(default_factory=dict)
-
-    def __post_init__(self) -> None:
-        setup = self.setup
+    def __init__(self, setup: Discovery, encodings: tuple[str, ...]) -> None:
+        self.setup = setup
+        self.encodings = encodings
+        self.lidars: list[ChosenLidar] = []
+        self.places: list[Place] = []
+        self._known: dict[tuple[int, int, Use], int] = {}
+        self._addresses: dict[int, str] = {}
+        # Lidar of each kind without a sensor, and of other packets near a lidar.
+        self._unmatched: dict[PacketKind, int] = {}
+        self._near: dict[PacketKind, int] = {}
+        # Lidar that has a new topic.
+        self._new_topics: dict[str, int] = {}
         self._topics = {
             topic.name: topic
             for recording in reversed(setup.recordings)
@@ -137,13 +133,13 @@ class Places:
         key = lidar, stream, use
         if key not in self._known:
             source = self.setup.sampler.table.streams[stream]
-            number = self._known[key] = len(self.places)
+            self._known[key] = len(self.places)
             if self.encodings:
                 messages = self._messages(lidar, source, use)
                 to = None if messages is None else Stream(topic=messages.topic.name)
-                self.places.append(Place(number, stream, to, messages))
+                self.places.append(Place(stream, to, messages))
             else:
-                self.places.append(Place(number, stream, self._address(lidar, source, use)))
+                self.places.append(Place(stream, self._address(lidar, source, use)))
         return self._known[key]
 
     def main_place(self, lidar: int) -> Place | None:

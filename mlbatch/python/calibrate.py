@@ -139,7 +139,7 @@ def calibrate(
         )
     run = Conversion(job)
     streams = ImuStreams(run.sensors)
-    run.imu_users.append(streams)
+    run.imu_users.append(streams.add)
     names = [sensor.name for sensor in run.sensors]
     if len(names) < 2:
         raise UsageError(
