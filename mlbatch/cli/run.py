@@ -34,8 +34,6 @@ from mlbatch.writers.atomic import discard
 
 # Loaded where it is needed: a dry run has no files.
 if TYPE_CHECKING:
-    from mlbatch.pipeline.files import Files
-    from mlbatch.pipeline.job import Shard
     from mlbatch.reports.limits import Limit
 
 
@@ -93,7 +91,13 @@ def _run_one(job: Job, target: Target) -> list[str]:
         say(f"warning: {note.code}: {note.message}")
     if job.shard is not None and output.files is not None:
         if not target.quiet:
-            _print_shard(job.shard, output.files, report, target)
+            number, count = job.shard.number, job.shard.count
+            text = (
+                f"wrote {target.written}: shard {number} of {count}, {output.files.scans} of "
+                f"{output.files.total} scans, {report.scans.points} points; join all {count} with "
+                "mlbatch merge"
+            )
+            typer.echo(one_line(text))
         return []
     _write_page(conversion, report, target)
     if target.prints_report or (request.dry_run and report_path is None):
@@ -183,17 +187,6 @@ def _check_shard(target: Target) -> None:
             )
 
 
-def _print_shard(shard: Shard, files: Files, inputs: RunReport, target: Target) -> None:
-    """Print what a shard has written."""
-    typer.echo(
-        one_line(
-            f"wrote {target.written}: shard {shard.number} of {shard.count}, {files.scans} of "
-            f"{files.total} scans, {inputs.scans.points} points; join all {shard.count} with "
-            "mlbatch merge"
-        )
-    )
-
-
 def _check_page(target: Target, report_path: Path | None, name: str) -> None:
     """Refuse a page that cannot be written, before the run; name: of the output's format."""
     if target.html is None:
@@ -271,7 +264,8 @@ def _run_segments(job: Job, target: Target) -> list[str]:
         try:
             if target.request.resume:
                 # The end of the segment is needed first: complete segments are not made again.
-                _refuse_jump(one)
+                for _ in Conversion(one).windows():
+                    pass
             label = "" if is_whole else f"segment {number}: "
             beyond += [f"{label}{line}" for line in _run_one(one, own_target)]
             outputs += 1
@@ -300,12 +294,6 @@ def _run_segments(job: Job, target: Target) -> list[str]:
             "write partial ones with --keep-partial"
         )
     return beyond
-
-
-def _refuse_jump(job: Job) -> None:
-    """Raise the first clock step in the session of a job; nothing is decoded."""
-    for _ in Conversion(job).windows():
-        pass
 
 
 def _numbered(target: Target, number: int) -> Target:

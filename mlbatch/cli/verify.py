@@ -85,7 +85,7 @@ def _lines(verdict: Verdict) -> list[str]:
         (
             check.name,
             str(check.checked or ""),
-            _outcome(check.violations, check.outcome),
+            f"{check.violations} violated" if check.violations else check.outcome,
             check.limit,
         )
         for check in verdict.checks
@@ -97,7 +97,3 @@ def _lines(verdict: Verdict) -> list[str]:
     if verdict.count > len(shown):
         lines.append(f"and {verdict.count - len(shown)} more")
     return lines
-
-
-def _outcome(violations: int, outcome: str) -> str:
-    return f"{violations} violated" if violations else outcome

@@ -58,7 +58,11 @@ def view(
             with ViewServer(title, scans, total, port, expected) as server:
                 typer.echo(f"{server.url} shows {one_line(title)}; Ctrl-C ends")
                 sys.stdout.flush()
-                if not no_browser and _has_screen():
+                # Elsewhere only a browser in the terminal could be opened.
+                has_screen = sys.platform != "linux" or any(
+                    map(os.environ.get, ("DISPLAY", "WAYLAND_DISPLAY"))
+                )
+                if not no_browser and has_screen:
                     import webbrowser
 
                     # Some browsers return when they end.
@@ -130,11 +134,6 @@ def _windows_of(table: str) -> int:
     from mlbatch.outputs.table import read_table
 
     return len(np.unique(read_table(table, "scans.csv")["start_ns"]))
-
-
-def _has_screen() -> bool:
-    """False where only a browser in the terminal could be opened."""
-    return sys.platform != "linux" or any(map(os.environ.get, ("DISPLAY", "WAYLAND_DISPLAY")))
 
 
 def _print_error(text: str) -> None:

@@ -97,8 +97,13 @@ class Router:
             if kind.size in (sensor.lidar.packet_size, sensor.lidar.packet_size + 1)
             and self._may_own(sensor, kind, stream, payload)
         )
+        for number in owners:
+            kinds = self._sensors[number].kinds
+            if kind not in kinds:
+                kinds.add(kind)
+                # Its neighbours may be IMU packets.
+                self._forget_unassigned()
         if owners:
-            self._join(kind, owners)
             return Route(Role.LIDAR, owners)
         imu = self._imu_owner(stream, kind.size)
         if imu is not None:
@@ -107,14 +112,6 @@ class Router:
             if kind.stream in sensor.streams:
                 return Route(Role.BAD_SIZE, (number,))
         return _UNASSIGNED
-
-    def _join(self, kind: PacketKind, owners: Sequence[int]) -> None:
-        """Add a kind to its sensors; unassigned neighbours may then be their IMU packets."""
-        for number in owners:
-            kinds = self._sensors[number].kinds
-            if kind not in kinds:
-                kinds.add(kind)
-                self._forget_unassigned()
 
     def _may_own(
         self, sensor: DetectedSensor, kind: PacketKind, stream: Stream, payload: U8Array

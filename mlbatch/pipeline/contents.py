@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 
 from mlbatch.errors import MlbatchError
 from mlbatch.readers import has_packets
-from mlbatch.types import Message, Recording, StreamTable, Topic
+from mlbatch.types import Message, Recording, StreamTable
 from mlbatch.units import NS_PER_S
 
 
@@ -47,7 +47,9 @@ class TopicCounter:
         left_out = frozenset(streams)
         counter = cls()
         for recording in recordings:
-            others = [one for one in recording.topics if _is_other(one, left_out)]
+            others = [
+                one for one in recording.topics if one.name not in left_out and not has_packets(one)
+            ]
             recording.keep = frozenset(topic.name for topic in others)
             for topic in others:
                 counter._counts[topic.name, topic.type] = (0, 0, 0)
@@ -69,10 +71,6 @@ class TopicCounter:
             span_ns = last_ns - first_ns
             rate_hz = (count - 1) * NS_PER_S / span_ns if span_ns > 0 else 0.0
             yield TopicReport(name, type_, count, rate_hz, first_ns, last_ns)
-
-
-def _is_other(topic: Topic, streams: frozenset[str]) -> bool:
-    return topic.name not in streams and not has_packets(topic)
 
 
 def recording_report(recording: Recording) -> RecordingReport:

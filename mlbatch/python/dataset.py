@@ -106,7 +106,14 @@ def dataset_of(paths: Iterable[Path]) -> Dataset:
             for match in sorted(glob.glob(str(path), recursive=True))
             for output in _of_session(Path(match))
         ]
-        finished = [match for match in matches if _is_whole(match) and is_output(match)]
+        # Neither of unfinished runs nor shards.
+        finished = [
+            match
+            for match in matches
+            if match.suffix != PARTIAL_SUFFIX
+            and not (match / SHARD_JSON).exists()
+            and is_output(match)
+        ]
         if not finished:
             raise UsageError(
                 f"{path}: expected outputs of `mlbatch convert`, found {len(matches)} other paths; "
@@ -132,8 +139,3 @@ def _of_session(path: Path) -> list[Path]:
         return [path / name for name in record["outputs"]] if is_done else [path]
     except (OSError, ValueError, LookupError, TypeError):
         return [path]
-
-
-def _is_whole(path: Path) -> bool:
-    """Whether a path is neither of an unfinished run nor a shard."""
-    return path.suffix != PARTIAL_SUFFIX and not (path / SHARD_JSON).exists()

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from functools import partial
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple, TypeAlias
 
 from mlbatch.errors import UsageError
@@ -33,13 +32,13 @@ class Limit(NamedTuple):
         """Text that says how the limit is exceeded; "" if it is not."""
         if self.quantity == POSE:
             return self._exceeded_by_pose(report)
-        quantity = _QUANTITIES[self.quantity]
-        for owner, (part, whole) in quantity.amounts(report):
+        unit, is_share = _QUANTITIES[self.quantity]
+        for owner, (part, whole) in _amounts(self.quantity, report).items():
             share = 100 * part / whole if whole else 0.0
             if (share if self.unit else part) > self.most:
-                found = f"{part} of {whole} ({share:.4g} %)" if quantity.is_share else str(part)
+                found = f"{part} of {whole} ({share:.4g} %)" if is_share else str(part)
                 sensor = f"{owner}: " if owner else ""
-                return f"{self.text}: found {sensor}{found} {quantity.unit}"
+                return f"{self.text}: found {sensor}{found} {unit}"
         return ""
 
     def _exceeded_by_pose(self, report: RunReport) -> str:
@@ -90,13 +89,13 @@ def _parsed(text: str) -> Limit:
                 f"{text.strip()!r}; write {POSE}>5cm"
             )
         return Limit(text.strip(), name, float(number), unit)
-    quantity = _QUANTITIES.get(name)
-    if quantity is None:
+    if name not in _QUANTITIES:
         known = ", ".join((*_QUANTITIES, POSE))
         raise UsageError(f"--fail-on: expected one of {known}, found {name!r}; {_EXAMPLE}")
-    if unit and (unit != "%" or not quantity.is_share):
+    words, is_share = _QUANTITIES[name]
+    if unit and (unit != "%" or not is_share):
         raise UsageError(
-            f"--fail-on: expected a number of {quantity.unit}, found {text.strip()!r}; "
+            f"--fail-on: expected a number of {words}, found {text.strip()!r}; "
             f"write {name}>{number}"
         )
     return Limit(text.strip(), name, float(number), unit)
@@ -105,58 +104,34 @@ def _parsed(text: str) -> Limit:
 # -- quantities -----------------------------------------------------------------------------------
 
 
-def _loss(report: RunReport) -> Iterator[tuple[str, Amount]]:
-    for sensor in report.sensors:
-        packets = sensor.ledger.packets
-        yield sensor.name, (packets.lost, packets.lost + packets.accepted)
-
-
-def _rejected(report: RunReport) -> Iterator[tuple[str, Amount]]:
-    for sensor in report.sensors:
-        packets = sensor.ledger.packets
-        yield sensor.name, (sum(packets.rejected.values()), packets.read)
-
-
-def _scans(report: RunReport, key: str) -> Iterator[tuple[str, Amount]]:
-    yield "", (getattr(report.scans, key), report.scans.written)
-
-
-def _without_points(report: RunReport) -> Iterator[tuple[str, Amount]]:
-    for name, count in report.scans.no_points.items():
-        yield name, (count, report.scans.written)
-
-
-def _cut_off(report: RunReport) -> Iterator[tuple[str, Amount]]:
-    yield "", (sum(one.code == CUT_OFF for one in report.warnings), 0)
-
-
-def _warnings(report: RunReport) -> Iterator[tuple[str, Amount]]:
-    yield "", (sum(one.code not in ACCEPTED_WARNINGS for one in report.warnings), 0)
-
-
-class _Quantity(NamedTuple):
-    """A quantity of a report.
-
-    unit: for people; amounts: name of the sensor ("": the run) and amount; is_share: whether the
-    amount is a part of its whole.
-    """
-
-    unit: str
-    amounts: Callable[[RunReport], Iterator[tuple[str, Amount]]]
-    is_share: bool = True
-
-
-_QUANTITIES: Mapping[str, _Quantity] = {
-    "loss": _Quantity("packets lost", _loss),
-    "rejected": _Quantity("packets rejected", _rejected),
-    "underfilled": _Quantity("scans underfilled", partial(_scans, key="underfilled")),
-    "incomplete": _Quantity("scans incomplete", partial(_scans, key="incomplete")),
-    "no_points": _Quantity("scans without its points", _without_points),
-    "empty_clouds": _Quantity("clouds without points", partial(_scans, key="empty_clouds"), False),
-    "empty": _Quantity("windows empty", partial(_scans, key="empty"), False),
-    "dropped_incomplete": _Quantity(
-        "windows left out", partial(_scans, key="dropped_incomplete"), False
-    ),
-    "cut_off": _Quantity("recordings cut off", _cut_off, False),
-    "warnings": _Quantity("warnings", _warnings, False),
+# Unit for people, and whether an amount is a share of its whole.
+_QUANTITIES: Mapping[str, tuple[str, bool]] = {
+    "loss": ("packets lost", True),
+    "rejected": ("packets rejected", True),
+    "underfilled": ("scans underfilled", True),
+    "incomplete": ("scans incomplete", True),
+    "no_points": ("scans without its points", True),
+    "empty_clouds": ("clouds without points", False),
+    "empty": ("windows empty", False),
+    "dropped_incomplete": ("windows left out", False),
+    "cut_off": ("recordings cut off", False),
+    "warnings": ("warnings", False),
 }
+
+
+def _amounts(quantity: str, report: RunReport) -> dict[str, Amount]:
+    """Amounts of a quantity by sensor, or of the run ("")."""
+    scans = report.scans
+    packets = {sensor.name: sensor.ledger.packets for sensor in report.sensors}
+    codes = [one.code for one in report.warnings]
+    if quantity == "loss":
+        return {name: (one.lost, one.lost + one.accepted) for name, one in packets.items()}
+    if quantity == "rejected":
+        return {name: (sum(one.rejected.values()), one.read) for name, one in packets.items()}
+    if quantity == "no_points":
+        return {name: (count, scans.written) for name, count in scans.no_points.items()}
+    if quantity == "cut_off":
+        return {"": (codes.count(CUT_OFF), 0)}
+    if quantity == "warnings":
+        return {"": (sum(code not in ACCEPTED_WARNINGS for code in codes), 0)}
+    return {"": (getattr(scans, quantity), scans.written)}
