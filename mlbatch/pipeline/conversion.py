@@ -34,6 +34,7 @@ from mlbatch.types import (
     Message,
     RunInfo,
     Scan,
+    SensorInfo,
     Topic,
     Window,
     WindowColumns,
@@ -373,11 +374,34 @@ class Conversion:
         return self._pool
 
     def _run_info(self) -> RunInfo:
-        """Properties of the run, once there is a window."""
+        """The description that all scans share, once there is a window."""
+        job, setup = self.job, self.session.setup
+        sensors = tuple(
+            SensorInfo(
+                sensor.name,
+                sensor.lidar.model,
+                sensor.lidar.channels,
+                sensor.lidar.returns,
+                sensor.source.ring_base,
+                sensor.body_from_sensor,
+                sensor.lidar.has_reflectivity,
+                sensor.lidar.sensor_from_imu(),
+            )
+            for sensor in self.sensors
+        )
+        # Of recorded messages, which are written, too.
         forwards = self.passthrough.messages.is_asked(self.session.recordings)
-        shared = common_timescale(self._timescales())
-        return self.session.run_info(
-            rate_text(self.grid.rate), shared, self.batcher.t_init_ns, forwards=forwards
+        return RunInfo(
+            sensors,
+            setup.frame_id,
+            rate_text(self.grid.rate),
+            common_timescale(self._timescales()),
+            job.slices,
+            job.layout,
+            job.sort,
+            tuple(setup.frames().items()) if forwards else (),
+            job.variants,
+            self.batcher.t_init_ns,
         )
 
     @property

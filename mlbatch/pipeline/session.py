@@ -29,8 +29,6 @@ from mlbatch.types import (
     Message,
     PacketBatch,
     Recording,
-    RunInfo,
-    SensorInfo,
     StreamTable,
     WrappedRecording,
 )
@@ -58,8 +56,8 @@ class Session:
     """The recordings of a job and the sensors found in them.
 
     setup: result of discovery; sensors: in the order of `lidar_id`;
-    replay: of injected faults, or None; delivered: packets given by `packets` so far; notes:
-    warnings so far.
+    replay: of injected faults, or None; delivered: packets given by `packets` so far; last_host_ns:
+    receive time of the newest, 0 before the first; notes: warnings so far.
     """
 
     def __init__(self, job: Job, progress: Callable[[int, int, int], None] | None = None) -> None:
@@ -67,7 +65,8 @@ class Session:
         self.job = job
         self.delivered = 0
         self.notes: list[Note] = []
-        self._received_ns: tuple[int, int] | None = None
+        self._first_host_ns = 0
+        self.last_host_ns = 0
         self._overlap: RunOverlap | None = None
         require_library()
         streams = StreamTable()
@@ -171,15 +170,12 @@ class Session:
         seen = None if self._overlap is None else self._overlap.add
         with contextlib.closing(self.setup.first.whole(is_without_packets, seen)) as batches:
             for batch in self._with_faults(batches):
-                self._count(batch)
+                if len(batch):
+                    if not self.delivered:
+                        self._first_host_ns = int(batch.host_ns[0])
+                    self.last_host_ns = int(batch.host_ns[-1])
+                    self.delivered += len(batch)
                 yield batch
-
-    def _count(self, batch: PacketBatch) -> None:
-        if not len(batch):
-            return
-        self.delivered += len(batch)
-        first_ns = int(batch.host_ns[0]) if self._received_ns is None else self._received_ns[0]
-        self._received_ns = first_ns, int(batch.host_ns[-1])
 
     @property
     def begin_ns(self) -> int | None:
@@ -191,16 +187,9 @@ class Session:
         return min((first_ns for first_ns in firsts_ns if first_ns is not None), default=None)
 
     @property
-    def last_host_ns(self) -> int:
-        """Receive time of the newest packet; 0 before the first."""
-        return 0 if self._received_ns is None else self._received_ns[1]
-
-    @property
     def recorded_s(self) -> float:
         """Time between the first and the last packet read, by the capture host."""
-        if self._received_ns is None:
-            return 0.0
-        return (self._received_ns[1] - self._received_ns[0]) / NS_PER_S
+        return (self.last_host_ns - self._first_host_ns) / NS_PER_S
 
     @property
     def size_bytes(self) -> int:
@@ -220,46 +209,6 @@ class Session:
         boxes_m = np.array(self.job.boxes_m, np.float64).reshape(-1, 6)
         rig = self.setup.rig
         return boxes_m if rig is None else np.concatenate([rig.exclude_boxes_m, boxes_m])
-
-    def run_info(
-        self,
-        rate_hz: str,
-        timescale: str,
-        t_init_ns: int | None = None,
-        *,
-        forwards: bool = False,
-    ) -> RunInfo:
-        """The description that all scans share.
-
-        rate_hz: exact rate as text; forwards: recorded messages are written, too.
-        """
-        job = self.job
-        sensors = tuple(
-            SensorInfo(
-                sensor.name,
-                sensor.lidar.model,
-                sensor.lidar.channels,
-                sensor.lidar.returns,
-                sensor.source.ring_base,
-                sensor.body_from_sensor,
-                sensor.lidar.has_reflectivity,
-                sensor.lidar.sensor_from_imu(),
-            )
-            for sensor in self.sensors
-        )
-        frames = tuple(self.setup.frames().items()) if forwards else ()
-        return RunInfo(
-            sensors,
-            self.setup.frame_id,
-            rate_hz,
-            timescale,
-            job.slices,
-            job.layout,
-            job.sort,
-            frames,
-            job.variants,
-            t_init_ns,
-        )
 
     # -- checks and warnings ------------------------------------------------------------------
 

@@ -15,7 +15,6 @@ from mlbatch.pipeline.conversion import Conversion, SkippedWindow
 from mlbatch.pipeline.job import Job
 from mlbatch.pipeline.sensor import sensors_of
 from mlbatch.types import EXTRAS, RunInfo, Scan, Window
-from mlbatch.units import rate_text
 from tests.reference.decoder import LiteralDecoder, check_scan
 
 # Layers of space, in which every sensor has some points.
@@ -91,10 +90,9 @@ def check_conversion(job: Job, wanted: Sequence[Job] = WANTED) -> list[Pair]:
 def _pair(run: Conversion, wanted: Job) -> Pair:
     assert run.info is not None
     session = run.session
-    info = session.run_info(rate_text(run.grid.rate), run.info.timescale)
     sensors = zip(sensors_of(session.setup, wanted, PacketArena()), run.sensors, strict=True)
     return Pair(
-        info._replace(layout=wanted.layout),
+        run.info._replace(layout=wanted.layout),
         [replace(new.source, ring=one.source.ring) for new, one in sensors],
         np.concatenate([session.boxes_m, np.array(wanted.boxes_m).reshape(-1, 6)]),
         wanted.extras,
