@@ -142,7 +142,7 @@ class _Packets(NamedTuple):
 
 def _packets(sampler: Sampler, kind: PacketKind, lidar: Lidar) -> _Packets:
     """Return the intact samples of a kind in which all columns are valid."""
-    payloads, host_ns, position = sampler.numbered_samples(kind, lidar)
+    payloads, host_ns, position = sampler.good_samples(kind, lidar)
     headers = lidar.column_headers(payloads, host_ns)
     whole = headers.valid.all(axis=1)
     stamp_ns = headers.stamp_ns[whole]

@@ -213,15 +213,11 @@ class Sampler:
         )
         return Evidence(stream, kind.size, *self.kinds[kind].arrays(), neighbours)
 
-    def good_samples(self, kind: PacketKind, lidar: Lidar) -> tuple[U8Array, I64Array]:
-        """Packets (k, packet_size) of a kind that a lidar sent intact, receive times (k,)."""
-        packets, host_ns, _ = self.numbered_samples(kind, lidar)
-        return packets, host_ns
+    def good_samples(self, kind: PacketKind, lidar: Lidar) -> tuple[U8Array, I64Array, I64Array]:
+        """Packets (k, packet_size) of a kind that a lidar sent intact.
 
-    def numbered_samples(
-        self, kind: PacketKind, lidar: Lidar
-    ) -> tuple[U8Array, I64Array, I64Array]:
-        """Return `good_samples`, and the position of each packet among all of its kind (k,)."""
+        With receive times (k,), and the position of each among all of its kind (k,).
+        """
         samples = self.kinds[kind]
         packets, host_ns = samples.arrays()
         packets = packets[:, : lidar.packet_size]
@@ -246,7 +242,7 @@ class Sampler:
         """
         firsts = []
         for kind in sensor.kinds:
-            packets, host_ns = self.good_samples(kind, sensor.lidar)
+            packets, host_ns, _ = self.good_samples(kind, sensor.lidar)
             headers = sensor.lidar.column_headers(packets, host_ns)
             rows = np.flatnonzero(headers.valid.any(axis=1))
             if not len(rows):
@@ -278,7 +274,7 @@ class Sampler:
 
     def _share_sent(self, kind: PacketKind, lidar: Lidar) -> float | None:
         """Valid columns sent per column of whole revolutions, from the first sample to the last."""
-        packets, host_ns = self.good_samples(kind, lidar)
+        packets, host_ns, _ = self.good_samples(kind, lidar)
         if len(packets) < 2 or host_ns[-1] - host_ns[0] < SHORTEST_NS:
             return None
         headers = lidar.column_headers(packets, host_ns)

@@ -18,7 +18,7 @@ from mlbatch.clocks.timescale import common_timescale
 from mlbatch.decode.decoder import Decoder
 from mlbatch.decode.groups import Source
 from mlbatch.discovery.types import OUTPUT, Note
-from mlbatch.errors import NoScanError, PacketError, UsageError
+from mlbatch.errors import NoScanError, PacketError, RecordingError, UsageError
 from mlbatch.pipeline import run_report
 from mlbatch.pipeline.decode_pool import DecodePool, DecodeTask
 from mlbatch.pipeline.job import DEFAULT_RATE, Job, TimeSegment
@@ -27,6 +27,7 @@ from mlbatch.pipeline.sensor import Sensor
 from mlbatch.pipeline.session import Session
 from mlbatch.reports.ledger import PointCounts
 from mlbatch.reports.poses import NOT_ASKED, ONE_LIDAR, PoseFigures
+from mlbatch.reports.report import ACCEPTED_WARNINGS
 from mlbatch.reports.scan_table import ScanTable
 from mlbatch.types import (
     BYTE_INTENSITY,
@@ -108,9 +109,9 @@ class SkippedWindow(NamedTuple):
 class Conversion:
     """One run: `windows`, `tasks` or `scans` drive it, `close` ends it.
 
-    info, table: None before the first window; poses: known once closed; dropped_incomplete:
-    windows left out by `--drop-incomplete`; notes_before_points: number of warnings that precede
-    those about points; users: of raw packets; imu_users: of samples of IMUs.
+    notes: warnings so far; info, table: None before the first window; poses: known once closed;
+    dropped_incomplete: windows left out by `--drop-incomplete`; notes_before_points: number of
+    warnings that precede those about points; users: of raw packets; imu_users: of samples of IMUs.
     """
 
     def __init__(self, job: Job, buffers: int = 1, progress: Progress | None = None) -> None:
@@ -119,6 +120,7 @@ class Conversion:
         progress: of the pass that `--align-clocks` makes here.
         """
         self.stages = Stages()
+        self.notes: list[Note] = []
         self.job = job
         self.session = Session(job, progress)
         self.sensors: Sequence[Sensor] = self.session.sensors
@@ -255,7 +257,8 @@ class Conversion:
                 if self.batcher.past_end and not self._awaits_poses():
                     break
                 self.session.keep_from(self._oldest_ring_index())
-        self.session.refuse_apart()
+        for note in self.session.refuse_apart():
+            self.warn(note)
         # Step 5: end of input; no sensor is waited for.
         is_short = False
         for window in self.batcher.finish(self.session.last_host_ns):
@@ -547,12 +550,9 @@ class Conversion:
 
     def warn(self, note: Note) -> None:
         """Add a warning; RecordingError with `--strict`."""
-        self.session.warn(note)
-
-    @property
-    def notes(self) -> Sequence[Note]:
-        """Warnings so far."""
-        return self.session.notes
+        if self.job.strict and note.code not in ACCEPTED_WARNINGS:
+            raise RecordingError(f"{note.message} ({note.code}, an error because of --strict)")
+        self.notes.append(note)
 
 
 def sweep_cutter(sensor: Sensor) -> SweepCutter:

@@ -16,7 +16,6 @@ from mlbatch.discovery.first_seconds import is_without_packets
 from mlbatch.discovery.match import release
 from mlbatch.discovery.sampler import clock_watch
 from mlbatch.discovery.types import Note, PacketKind
-from mlbatch.errors import RecordingError
 from mlbatch.native import require_library
 from mlbatch.native.arena import PacketArena
 from mlbatch.outputs.inputs import open_inputs
@@ -24,7 +23,6 @@ from mlbatch.pipeline.ingest import Ingest
 from mlbatch.pipeline.job import Job, TimeSegment
 from mlbatch.pipeline.sensor import Sensor, sensors_of
 from mlbatch.readers.source import BUFFER_BYTES
-from mlbatch.reports.report import ACCEPTED_WARNINGS
 from mlbatch.types import (
     Message,
     PacketBatch,
@@ -57,14 +55,13 @@ class Session:
 
     setup: result of discovery; sensors: in the order of `lidar_id`;
     replay: of injected faults, or None; delivered: packets given by `packets` so far; last_host_ns:
-    receive time of the newest, 0 before the first; notes: warnings so far.
+    receive time of the newest, 0 before the first.
     """
 
     def __init__(self, job: Job, progress: Callable[[int, int, int], None] | None = None) -> None:
         """progress: as `conversion.Progress`, of the pass for `--align-clocks`."""
         self.job = job
         self.delivered = 0
-        self.notes: list[Note] = []
         self._first_host_ns = 0
         self.last_host_ns = 0
         self._overlap: RunOverlap | None = None
@@ -226,17 +223,10 @@ class Session:
             if sensor.is_required and not sensor.ledger.packets.read:
                 refuse_absent(self.setup, sensor.detected, self.job.selection.rig)
 
-    def refuse_apart(self) -> None:
+    def refuse_apart(self) -> list[Note]:
         """Raise RecordingError if recordings do not overlap; a warning for optional sensors."""
         text = "" if self._overlap is None else self._overlap.finish()
-        if text:
-            self.warn(Note("no_overlap", "", text))
-
-    def warn(self, note: Note) -> None:
-        """Add a warning; RecordingError with `--strict`."""
-        if self.job.strict and note.code not in ACCEPTED_WARNINGS:
-            raise RecordingError(f"{note.message} ({note.code}, an error because of --strict)")
-        self.notes.append(note)
+        return [Note("no_overlap", "", text)] if text else []
 
 
 class _Segment(WrappedRecording):
