@@ -125,7 +125,7 @@ class Passthrough:
 
 
 class ImuQueue:
-    """IMU samples of all lidars.
+    """IMU samples of all lidars that wait, sorted by timestamp when they are asked for.
 
     counts: counters of each sensor; offsets_ns: added to the timestamps of each sensor; has_place:
     False if the output has no place for samples; then none is kept.
@@ -137,12 +137,17 @@ class ImuQueue:
         self._counts = list(counts)
         self._offsets_ns = list(offsets_ns)
         self._has_place = has_place
-        self._buffers = [_ImuBuffer(number) for number in range(len(self._counts))]
+        none = np.zeros((0, 3))
+        self._sorted = [
+            ImuSamples(sensor, np.zeros(0, np.int64), none, none) for sensor in range(len(counts))
+        ]
+        # In the order in which they came.
+        self._new: list[list[ImuSamples]] = [[] for _ in counts]
 
     @property
     def is_waiting(self) -> bool:
         """True if there are samples in the queue."""
-        return any(map(len, self._buffers))
+        return any(self._new) or any(len(samples.stamp_ns) for samples in self._sorted)
 
     def add(self, samples: ImuSamples) -> None:
         """Add samples of one sensor."""
@@ -157,14 +162,15 @@ class ImuQueue:
         if not sane.all():
             counts.drop("bad_stamp", int(np.count_nonzero(~sane)))
             samples = _part(samples, sane)
-        self._buffers[samples.sensor].add(samples)
+        if len(samples.stamp_ns):
+            self._new[samples.sensor].append(samples)
+        if len(self._new[samples.sensor]) > _MOST_PARTS:
+            self._sort(samples.sensor)
 
     def drop_before(self, low_ns: int) -> None:
         """Drop samples before the first limit."""
-        for counts, buffer in zip(self._counts, self._buffers, strict=True):
-            dropped = buffer.take_before(low_ns)
-            if dropped is not None:
-                counts.drop("outside_time", len(dropped.stamp_ns))
+        for sensor, counts in enumerate(self._counts):
+            counts.drop("outside_time", len(self._take(sensor, low_ns).stamp_ns))
 
     def drain_until(self, end_ns: int | None, limits_ns: TimeLimits) -> list[ImuSamples]:
         """Samples before `end_ns` (None: all) and inside the limits, by timestamp."""
@@ -172,61 +178,34 @@ class ImuQueue:
         if low_ns is not None:
             self.drop_before(low_ns if end_ns is None else min(low_ns, end_ns))
         taken = []
-        for counts, buffer in zip(self._counts, self._buffers, strict=True):
-            samples = buffer.take_before(end_ns)
-            if samples is not None and high_ns is not None:
-                count = int(np.searchsorted(samples.stamp_ns, high_ns))
+        for sensor, counts in enumerate(self._counts):
+            samples = self._take(sensor, end_ns)
+            if high_ns is not None:
+                count = int(samples.stamp_ns.searchsorted(high_ns))
                 counts.drop("outside_time", len(samples.stamp_ns) - count)
                 samples = _part(samples, slice(0, count))
-            if samples is not None and len(samples.stamp_ns):
+            if len(samples.stamp_ns):
                 counts.written += len(samples.stamp_ns)
                 taken.append(samples)
         return sorted(taken, key=lambda samples: (int(samples.stamp_ns[0]), samples.sensor))
 
-
-class _ImuBuffer:
-    """IMU samples of one sensor that wait, sorted by timestamp when they are asked for."""
-
-    def __init__(self, sensor: int) -> None:
-        none = np.zeros((0, 3))
-        self._sorted = ImuSamples(sensor, np.zeros(0, np.int64), none, none)
-        # Index of the first sample that was not taken.
-        self._at = 0
-        self._new: list[ImuSamples] = []
-
-    def __len__(self) -> int:
-        new = sum(len(samples.stamp_ns) for samples in self._new)
-        return len(self._sorted.stamp_ns) - self._at + new
-
-    def add(self, samples: ImuSamples) -> None:
-        """Add samples, in the order in which they came."""
-        if len(samples.stamp_ns):
-            self._new.append(samples)
-        if len(self._new) > _MOST_PARTS:
-            self._sort()
-
-    def take_before(self, end_ns: int | None) -> ImuSamples | None:
-        """Take the samples before a time (None: all); None without any."""
-        if self._new:
-            self._sort()
-        stamp_ns = self._sorted.stamp_ns
-        begin = self._at
-        if begin == len(stamp_ns):
-            return None
+    def _take(self, sensor: int, end_ns: int | None) -> ImuSamples:
+        """Take the samples of a sensor before a time (None: all)."""
+        if self._new[sensor]:
+            self._sort(sensor)
+        waiting = self._sorted[sensor]
+        stamp_ns = waiting.stamp_ns
         end = len(stamp_ns) if end_ns is None else int(stamp_ns.searchsorted(end_ns))
-        if end <= begin:
-            return None
-        self._at = end
-        return _part(self._sorted, slice(begin, end))
+        self._sorted[sensor] = _part(waiting, slice(end, None))
+        return _part(waiting, slice(0, end))
 
-    def _sort(self) -> None:
+    def _sort(self, sensor: int) -> None:
         """Sort what waits by timestamp: packets may be reordered."""
-        samples = _joined([_part(self._sorted, slice(self._at, None)), *self._new])
+        samples = _joined([self._sorted[sensor], *self._new[sensor]])
         if not bool((np.diff(samples.stamp_ns) >= 0).all()):
             samples = _part(samples, np.argsort(samples.stamp_ns, kind="stable"))
-        self._sorted = samples
-        self._at = 0
-        self._new = []
+        self._sorted[sensor] = samples
+        self._new[sensor] = []
 
 
 def _joined(parts: Sequence[ImuSamples]) -> ImuSamples:
