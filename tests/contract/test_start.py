@@ -76,7 +76,7 @@ NEEDLESS = (
     *("numpy.ma", "rosbags", "rich", "mcap.writer", "importlib.metadata"),
     *("mlbatch.readers.capture.odd", "dpkt", "mlbatch.page.templates", "jinja2"),
     *("mlbatch.sensors.advice", "mlbatch.pipeline.time_limits"),
-    *("mlbatch.reports.limits", "mlbatch.discovery.overlap"),
+    *("mlbatch.reports.limits", "mlbatch.discovery.overlap", "mlbatch.pipeline.imu_poses"),
 )
 
 
