@@ -22,7 +22,7 @@ from mlbatch.errors import NoScanError, PacketError, RecordingError, UsageError
 from mlbatch.pipeline import run_report
 from mlbatch.pipeline.decode_pool import DecodePool, DecodeTask
 from mlbatch.pipeline.job import DEFAULT_RATE, Job, TimeSegment
-from mlbatch.pipeline.passthrough import Passthrough
+from mlbatch.pipeline.passthrough import ImuQueue, MessageQueue
 from mlbatch.pipeline.sensor import Sensor
 from mlbatch.pipeline.session import Session
 from mlbatch.reports.ledger import PointCounts
@@ -31,6 +31,8 @@ from mlbatch.reports.report import ACCEPTED_WARNINGS
 from mlbatch.reports.scan_table import ScanTable
 from mlbatch.types import (
     BYTE_INTENSITY,
+    IMU,
+    MESSAGE_ENCODINGS,
     ImuSamples,
     Message,
     RunInfo,
@@ -77,18 +79,8 @@ class Stages:
         wall_s, cpu_s = self._started_s
         return time.perf_counter() - wall_s, time.process_time() - cpu_s
 
-    @contextlib.contextmanager
-    def timed(self, stage: str) -> Iterator[None]:
-        """Add the time of the block to a stage."""
-        began_s = time.perf_counter()
-        try:
-            yield
-        finally:
-            setattr(self, stage, getattr(self, stage) + time.perf_counter() - began_s)
-
     def each(self, stage: str, items: Iterator[Item]) -> Iterator[Item]:
         """Yield the items; the time to make them is added to a stage."""
-        # `timed` costs more than the rest of the loop.
         while True:
             began_s = time.perf_counter()
             try:
@@ -161,8 +153,15 @@ class Conversion:
             cutters = [sweep_cutter(sensor) for sensor in self.sensors]
             self.fusion = SweepFusion(job.batching, cutters, merge)
             self.users.append(self.fusion.oldest_ring_index)
-        self.passthrough = Passthrough(self.sensors, job)
-        self.passthrough.messages.refuse_unknown(self.session.recordings)
+        # What is forwarded in addition to scans.
+        self.imu = ImuQueue(
+            [sensor.ledger.imu_samples for sensor in self.sensors],
+            [sensor.clock.imu_offset_ns for sensor in self.sensors],
+            has_place=IMU in job.extras,
+        )
+        encodings = MESSAGE_ENCODINGS & job.extras
+        self.messages = MessageQueue(job.passed, encodings, job.segment.begin_ns)
+        self.messages.refuse_unknown(self.session.recordings)
         self.info: RunInfo | None = None
         self.table: ScanTable | None = None
         self.dropped_incomplete = 0
@@ -211,7 +210,7 @@ class Conversion:
 
     def topic_offset_ns(self, topic: Topic) -> int | None:
         """Scan clock minus receive time, as for messages of an IMU that are forwarded."""
-        if self.passthrough.messages.is_asked_for(topic):
+        if self.messages.is_asked_for(topic):
             return self._scan_offset_ns()
         is_epoch = common_timescale(self._timescales()) in _EPOCH_SCALES
         return self._scan_offset_ns() if is_epoch else None
@@ -237,7 +236,7 @@ class Conversion:
         Section 2.1 of Faitli et al. (2025): the columns of all sensors are taken by timestamp,
         smallest first, and cut at the bounds of an absolute grid.
         """
-        self.passthrough.messages.subscribe(self.session.recordings)
+        self.messages.subscribe(self.session.recordings)
         if progress is not None:
             # A pass begins: that of `--align-clocks` came before.
             progress(0, self.session.size_bytes, 0)
@@ -247,7 +246,14 @@ class Conversion:
                 ingested = self.session.ingest.columns(batch)
                 for user in self.imu_users:
                     user(ingested.imu, batch.messages)
-                self.passthrough.add(ingested.imu, batch.messages, self.batcher.limits_ns)
+                for samples in ingested.imu:
+                    self.imu.add(samples)
+                self.messages.add(batch.messages)
+                low_ns, _ = self.batcher.limits_ns
+                if low_ns is not None:
+                    # Otherwise all of it would wait for the first scan.
+                    self.imu.drop_before(low_ns)
+                    self.messages.drop_before(low_ns)
                 self._refuse_rejected()
                 # Steps 3 and 4: columns by timestamp; windows close behind the watermark.
                 yield from self.batcher.push(ingested.accepted, batch.host_ns)
@@ -320,8 +326,9 @@ class Conversion:
             for task in tasks:
                 if isinstance(task, SkippedWindow):
                     continue
-                with self.stages.timed("decode_s"):
-                    scan = self.pool.workers[0].decode(task).scan
+                began_s = time.perf_counter()
+                scan = self.pool.workers[0].decode(task).scan
+                self.stages.decode_s += time.perf_counter() - began_s
                 self.account(scan)
                 yield scan, task.only
         self.close()
@@ -393,7 +400,7 @@ class Conversion:
             for sensor in self.sensors
         )
         # Of recorded messages, which are written, too.
-        forwards = self.passthrough.messages.is_asked(self.session.recordings)
+        forwards = self.messages.is_asked(self.session.recordings)
         return RunInfo(
             sensors,
             setup.frame_id,
@@ -448,7 +455,7 @@ class Conversion:
         timed = all(sensor.clock.has_receive_times for sensor in self.sensors)
         line = f"clock: {{offset_s: {-offset_ns / NS_PER_S:.3f}}}"
         text = remedies(line, timed=timed, sensors=len(self.sensors))
-        self.passthrough.messages.check_clock(self.session.recordings, offset_ns, text)
+        self.messages.check_clock(self.session.recordings, offset_ns, text)
 
     # -- accounting ---------------------------------------------------------------------------
 
@@ -466,15 +473,18 @@ class Conversion:
     def passed_through(
         self, end_ns: int | None, most_bytes: float = math.inf
     ) -> list[ImuSamples | Message]:
-        """IMU samples and recorded messages before `end_ns` (None: all), each given once.
+        """IMU samples, then messages, before `end_ns` (None: all), each given once.
 
         most_bytes: of messages, before the rest is left for the next call.
         """
-        if not self.passthrough.is_waiting:
-            return []
-        return self.passthrough.drain_until(
-            end_ns, self.batcher.limits_ns, self._clock_offset_ns(), most_bytes
-        )
+        limits_ns = self.batcher.limits_ns
+        found: list[ImuSamples | Message] = []
+        if self.imu.is_waiting:
+            found += self.imu.drain_until(end_ns, limits_ns)
+        if self.messages.is_waiting:
+            offset_ns = self._clock_offset_ns()
+            found += self.messages.drain_until(end_ns, limits_ns, offset_ns, most_bytes)
+        return found
 
     def _clock_offset_ns(self) -> int | None:
         """Scan clock minus receive time; None where scans are not on an epoch clock."""

@@ -28,10 +28,8 @@ from mlbatch.arrays import BoolArray, I64Array
 from mlbatch.batching.intake import STAMP_LIMIT_NS
 from mlbatch.clocks.timescale import format_difference
 from mlbatch.errors import ClockError, ExportError, UsageError
-from mlbatch.pipeline.job import Job
-from mlbatch.pipeline.sensor import Sensor
 from mlbatch.reports.ledger import DecodedCounts
-from mlbatch.types import IMU, MESSAGE_ENCODINGS, ImuSamples, Message, Recording, Topic
+from mlbatch.types import ImuSamples, Message, Recording, Topic
 from mlbatch.units import NS_PER_S
 
 if TYPE_CHECKING:
@@ -73,55 +71,6 @@ _READ_BYTES = 1 << 16
 
 # Lower and upper end of --start/--end, ns; None: no limit.
 TimeLimits = tuple[int | None, int | None]
-
-
-class Passthrough:
-    """Data that a run forwards in addition to scans: IMU samples of lidars, messages of bags."""
-
-    def __init__(self, sensors: Sequence[Sensor], job: Job) -> None:
-        self.imu = ImuQueue(
-            [sensor.ledger.imu_samples for sensor in sensors],
-            [sensor.clock.imu_offset_ns for sensor in sensors],
-            has_place=IMU in job.extras,
-        )
-        self.messages = MessageQueue(
-            job.passed, MESSAGE_ENCODINGS & job.extras, job.segment.begin_ns
-        )
-
-    def add(
-        self, imu: Iterable[ImuSamples], messages: Iterable[Message], limits_ns: TimeLimits
-    ) -> None:
-        """Add IMU samples and messages of a batch; what is before `--start` is dropped at once."""
-        for samples in imu:
-            self.imu.add(samples)
-        self.messages.add(messages)
-        low_ns, _ = limits_ns
-        if low_ns is not None:
-            # Otherwise all of it would wait for the first scan.
-            self.imu.drop_before(low_ns)
-            self.messages.drop_before(low_ns)
-
-    @property
-    def is_waiting(self) -> bool:
-        """True if there are samples or messages in the queues."""
-        return self.imu.is_waiting or self.messages.is_waiting
-
-    def drain_until(
-        self,
-        end_ns: int | None,
-        limits_ns: TimeLimits,
-        clock_offset_ns: int | None,
-        most_bytes: float = math.inf,
-    ) -> list[ImuSamples | Message]:
-        """IMU samples, then messages, before `end_ns` (None: all) and inside the limits.
-
-        clock_offset_ns: scan clock minus receive time; None where scans are on no epoch clock;
-        most_bytes: of messages, before the rest is left for the next call.
-        """
-        return [
-            *self.imu.drain_until(end_ns, limits_ns),
-            *self.messages.drain_until(end_ns, limits_ns, clock_offset_ns, most_bytes),
-        ]
 
 
 class ImuQueue:

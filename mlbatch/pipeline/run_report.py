@@ -74,7 +74,7 @@ def run_report(run: Conversion) -> RunReport:
             ForwardedMessages(
                 topic, counts.read, counts.written, ordered(counts.dropped, PASS_REASONS)
             )
-            for topic, counts in sorted(run.passthrough.messages.counts.items())
+            for topic, counts in sorted(run.messages.counts.items())
         ),
         faults=()
         if run.session.replay is None
@@ -338,8 +338,8 @@ def unassigned_notes(run: Conversion) -> Iterator[Note]:
 def message_notes(run: Conversion) -> list[Note]:
     """Warnings about messages that could not be forwarded."""
     notes = []
-    for topic, counts in run.passthrough.messages.counts.items():
-        if run.passthrough.messages.has_place and (other := counts.dropped.get("no_place")):
+    for topic, counts in run.messages.counts.items():
+        if run.messages.has_place and (other := counts.dropped.get("no_place")):
             text = f"{topic}: {other} message(s) dropped: the output cannot store its ROS version"
             notes.append(Note("other_ros", "", text))
         if other := counts.dropped.get("other_clock"):

@@ -97,7 +97,7 @@ def test_what_passes_by_can_be_taken_at_every_window(tmp_path: Path) -> None:
     for item in run.tasks():
         assert isinstance(item, SkippedWindow)
         run.passed_through(item.end_ns)
-        waiting.append(run.passthrough.messages.waiting)
+        waiting.append(run.messages.waiting)
     assert len(waiting) > TURNS - 3
     assert all(a - b == TURN_NS // EVERY_NS for a, b in itertools.pairwise(waiting[1:]))
 
@@ -125,7 +125,7 @@ def test_a_recording_of_messages_alone_is_read_along_with_the_packets(tmp_path: 
     run = Conversion(Job(tuple(paths), selection, passed=("/note",), extras=MESSAGE_ENCODINGS))
     most = taken = 0
     for item in run.tasks():
-        most = max(most, run.passthrough.messages.waiting)
+        most = max(most, run.messages.waiting)
         taken += len(run.passed_through(item.end_ns))
     assert taken + len(run.passed_through(None)) == NOTES
     assert most < NOTES * 2 // 3
