@@ -27,7 +27,7 @@ from mlbatch.errors import RigError
 from mlbatch.native.capture import CaptureLoops
 from mlbatch.readers import has_packets, merge
 from mlbatch.readers.byte_records import SLACK
-from mlbatch.readers.merge import Seen
+from mlbatch.readers.merge import Seen, never
 from mlbatch.rig.rig import Rig, RigSensor
 from mlbatch.types import PacketBatch, Recording, StreamTable
 from mlbatch.units import NS_PER_MS, NS_PER_S
@@ -102,11 +102,11 @@ class FirstSeconds:
         self._kept.append(replace(batch, data=data, start=start, place=None))
 
     def _read(
-        self, by_log_time: ByLogTime | None = None, seen: Seen | None = None
+        self, by_log_time: ByLogTime = never, seen: Seen | None = None
     ) -> Iterator[PacketBatch]:
         end_ns: int | None = None
         kind_filter, checked = KindFilter(), Counter[PacketKind]()
-        with contextlib.closing(self._merged(by_log_time, seen)) as batches:
+        with contextlib.closing(merge(self.recordings, by_log_time, seen)) as batches:
             for batch in batches:
                 row = 0
                 if end_ns is None:
@@ -123,13 +123,6 @@ class FirstSeconds:
                 yield batch
         self._is_all = True
 
-    def _merged(
-        self, by_log_time: ByLogTime | None, seen: Seen | None
-    ) -> Generator[PacketBatch, None, None]:
-        if by_log_time is None:
-            return merge(self.recordings)
-        return merge(self.recordings, by_log_time, seen)
-
     # -- packets ------------------------------------------------------------------------------
 
     @property
@@ -142,13 +135,13 @@ class FirstSeconds:
         return self._read(by_log_time, seen) if self._kept is None else iter(self._kept)
 
     def whole(
-        self, by_log_time: ByLogTime | None = None, seen: Seen | None = None
+        self, by_log_time: ByLogTime = never, seen: Seen | None = None
     ) -> Generator[PacketBatch, None, None]:
         """Yield all packets of the session, as `merge` does; kept packets are not read again."""
         if self._is_all and self._kept is not None:
             yield from self._kept
             return
-        yield from self._merged(by_log_time, seen)
+        yield from merge(self.recordings, by_log_time, seen)
 
     # -- coarse offsets -----------------------------------------------------------------------
 

@@ -25,7 +25,6 @@ from mlbatch.pipeline.job import DEFAULT_RATE, Job, TimeSegment
 from mlbatch.pipeline.passthrough import ImuQueue, MessageQueue
 from mlbatch.pipeline.sensor import Sensor
 from mlbatch.pipeline.session import Session
-from mlbatch.reports.ledger import PointCounts
 from mlbatch.reports.poses import NOT_ASKED, ONE_LIDAR, PoseFigures
 from mlbatch.reports.report import ACCEPTED_WARNINGS
 from mlbatch.reports.scan_table import ScanTable
@@ -466,10 +465,6 @@ class Conversion:
         if self.table is not None:
             self.table.add(scan, checksum, is_listed)
 
-    def points(self, sensor: int) -> PointCounts:
-        """Point counters of a sensor so far."""
-        return PointCounts() if self._pool is None else self._pool.points(sensor)
-
     def passed_through(
         self, end_ns: int | None, most_bytes: float = math.inf
     ) -> list[ImuSamples | Message]:
@@ -481,7 +476,7 @@ class Conversion:
         found: list[ImuSamples | Message] = []
         if self.imu.is_waiting:
             found += self.imu.drain_until(end_ns, limits_ns)
-        if self.messages.is_waiting:
+        if self.messages.waiting:
             offset_ns = self._clock_offset_ns()
             found += self.messages.drain_until(end_ns, limits_ns, offset_ns, most_bytes)
         return found
@@ -544,7 +539,8 @@ class Conversion:
             ledger.columns.reused = self.fusion.reused[sensor.index]
         if self.deskew is not None:
             ledger.columns.drop("no_pose", self.deskew.dropped[sensor.index])
-        ledger.points = self.points(sensor.index)
+        if self._pool is not None:
+            ledger.points = self._pool.points(sensor.index)
 
     def _refuse_rejected(self) -> None:
         """With --strict, raise PacketError if a packet was rejected."""

@@ -231,11 +231,6 @@ class MessageQueue:
         return len(self._near) + len(self._far)
 
     @property
-    def is_waiting(self) -> bool:
-        """True if there are messages in the queue."""
-        return bool(self._near) or len(self._far) > 0
-
-    @property
     def has_place(self) -> bool:
         """True if the output can store messages at all."""
         return bool(self._encodings)

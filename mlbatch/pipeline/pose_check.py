@@ -33,7 +33,10 @@ _NEAREST_M, _FARTHEST_M = 1.0, 60.0
 
 
 class PoseCheck:
-    """Takes windows or their slices; `figures` once all are there."""
+    """Takes windows or their slices; `figures` once all are there.
+
+    is_over: more windows would change nothing.
+    """
 
     def __init__(
         self,
@@ -47,7 +50,7 @@ class PoseCheck:
         self._slices = slices
         self._decode = decode
         self._comparison: PoseComparison | None = None
-        self._is_over = False
+        self.is_over = False
         # Windows so far, and the number of the next one that begins a place.
         self._windows = -1
         self._next = 1
@@ -60,7 +63,7 @@ class PoseCheck:
 
     def add(self, window: Window) -> None:
         """Add the next window, or slice."""
-        if self._is_over or window.is_partial:
+        if self.is_over or window.is_partial:
             return
         if window.index != self._index:
             if window.start_ns != self._instant_ns:
@@ -73,11 +76,6 @@ class PoseCheck:
         self._parts.append([self._points(window, lidar) for lidar in range(len(self._sensors))])
         if window.slice == self._slices - 1:
             self._compare(window)
-
-    @property
-    def is_over(self) -> bool:
-        """Whether more windows would change nothing."""
-        return self._is_over
 
     def figures(self) -> PoseFigures:
         """Return the outcome for each pair of lidars."""
@@ -115,7 +113,7 @@ class PoseCheck:
             self._begun = None
         if self._begun is None:
             self._next = 2 * self._next + 1
-            self._is_over = self._comparison.is_settled
+            self.is_over = self._comparison.is_settled
 
     def _clouds(self) -> list[Cloud]:
         """Take the points of each lidar in the newest window."""

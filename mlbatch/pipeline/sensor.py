@@ -85,11 +85,6 @@ class Sensor:
         """Entry in the rig file, None without a rig."""
         return self.detected.rig
 
-    @property
-    def is_required(self) -> bool:
-        """True if the rig requires at least one packet of it."""
-        return self.rig is not None and not self.rig.optional
-
     def message_ns(self, table: StreamTable) -> float:
         """Longest time of a message of several packets of this sensor, ns; 0: single ones."""
         lidar = self.lidar

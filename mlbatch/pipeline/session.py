@@ -220,7 +220,8 @@ class Session:
     def refuse_absent(self) -> None:
         """Raise RigError if a sensor that the rig requires sent no packet."""
         for sensor in self.sensors:
-            if sensor.is_required and not sensor.ledger.packets.read:
+            is_required = sensor.rig is not None and not sensor.rig.optional
+            if is_required and not sensor.ledger.packets.read:
                 refuse_absent(self.setup, sensor.detected, self.job.selection.rig)
 
     def refuse_apart(self) -> list[Note]:

@@ -30,13 +30,14 @@ _NONE = np.zeros(0, np.int64)
 _NOTHING = PacketBatch(np.zeros(0, np.uint8), _NONE, _NONE, _NONE, _NONE)
 
 
-def _never(recording: Recording) -> bool:
+def never(recording: Recording) -> bool:
+    """False: packets are merged by receive time."""
     return False
 
 
 def merge(
     recordings: Sequence[Recording],
-    by_log_time: Callable[[Recording], bool] = _never,
+    by_log_time: Callable[[Recording], bool] = never,
     seen: Seen | None = None,
 ) -> Generator[PacketBatch, None, None]:
     """Yield all packets of all recordings; batches of a single recording are passed on as they are.

@@ -189,8 +189,11 @@ class ScanTable:
         shares = _share_cells(
             *(row.coverage, row.overlap, row.columns, self._columns_per_s, length_ns, row.fill)
         )
+        stamps = f"{row.first_stamp_ns},{row.last_stamp_ns}" if any(row.columns) else ","
+        places = f"{row.key[0]},{row.key[1]},{row.start_ns},{row.end_ns},{stamps},{row.points}"
         counts = _count_cells(row.columns, row.complete)
-        return f"{row.places()},{counts},{row.gaps()},{shares},{row.checksum},{row.ready_host_ns}\n"
+        gaps = ",".join(map(str, row.max_gap_ns))
+        return f"{places},{counts},{gaps},{shares},{row.checksum},{row.ready_host_ns}\n"
 
     def _add_totals(self, row: _Row) -> None:
         if row.is_partial:
@@ -319,16 +322,6 @@ class _Row(NamedTuple):
             # A sum, as readers may have the scans of a window in another order.
             checksum=NO_CHECKSUM if NO_CHECKSUM in sums else sum(sums) % _CHECKSUMS,
         )
-
-    def places(self) -> str:
-        """The cells up to the number of points."""
-        index, part = self.key
-        stamps = f"{self.first_stamp_ns},{self.last_stamp_ns}" if any(self.columns) else ","
-        return f"{index},{part},{self.start_ns},{self.end_ns},{stamps},{self.points}"
-
-    def gaps(self) -> str:
-        """The cells of gaps."""
-        return ",".join(map(str, self.max_gap_ns))
 
 
 # Few of these cells differ from row to row, and to format them costs more than to look them up.
