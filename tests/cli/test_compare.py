@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import re
 import sys
-from pathlib import Path
 
 import pytest
 
@@ -66,41 +65,6 @@ def test_latencies_of_the_fixture(shell: Shell) -> None:
     }
     found = {name: latency["p50"] for name, latency in policies.items()}
     assert found == pytest.approx(expected, abs=0.6)
-
-
-FIGURES = ["columns", "latency", "offsets", "spans"]
-
-
-def test_a_page_and_figures(shell: Shell, tmp_path: Path) -> None:
-    words = f"compare {CAPTURE} --rig {FIXTURE / 'rig.yaml'} --html run.html --figures plots"
-    outcome = shell(words)
-    assert (outcome.code, outcome.err) == (0, "")
-    page = (tmp_path / "run.html").read_text()
-    assert "Joined sweeps span up to 163 ms (latest sweeps), windows up to 100 ms" in page
-    # 163 ms at 10 m/s.
-    assert "moves 1.63 m within such a set" in page
-    written = sorted(path.name for path in (tmp_path / "plots").iterdir())
-    assert written == sorted(f"{name}.{kind}" for name in FIGURES for kind in ("pdf", "png"))
-    lines = outcome.out.splitlines()
-    assert lines[-1] == "wrote run.html"
-    assert sum(line.startswith("wrote plots/") for line in lines) == len(written)
-    first = {path.name: path.read_bytes() for path in (tmp_path / "plots").iterdir()}
-    assert all(data.startswith((b"%PDF", b"\x89PNG")) for data in first.values())
-    refused = shell(words)
-    assert refused.code == 1
-    assert "replace it with --overwrite" in refused.err
-    assert shell(f"{words} --overwrite").code == 0
-    assert first == {path.name: path.read_bytes() for path in (tmp_path / "plots").iterdir()}
-
-
-def test_a_page_may_be_printed(shell: Shell, tmp_path: Path) -> None:
-    words = f"compare {CAPTURE} --rig {FIXTURE / 'rig.yaml'} --html -"
-    outcome = shell(words)
-    assert outcome.code == 0
-    assert outcome.out.startswith("<!DOCTYPE html>")
-    assert outcome.out.endswith("</html>\n")
-    assert list(tmp_path.iterdir()) == []
-    assert shell(f"{words} --json").code == 2
 
 
 def test_figures_without_matplotlib(shell: Shell, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -10,7 +10,6 @@ import pytest
 import typer.main
 
 from mlbatch.cli.app import COMMANDS, PRINTABLE, command_line
-from mlbatch.rig.rig import read_rig
 from tests.builders.sessions import CAPTURE, NS_PER_S, RIG, Shell, Unit, report_of, write_session
 
 
@@ -56,22 +55,6 @@ def test_paths_of_all_commands_are_tested() -> None:
     assert ("convert", "--output", False) in _paths()
 
 
-@pytest.mark.parametrize("jobs", ["1", "3"])
-def test_a_printed_report_is_alone_and_complete(shell: Shell, tmp_path: Path, jobs: str) -> None:
-    outcome = shell(f"convert {CAPTURE} --rig {RIG} -o out --report - --jobs {jobs}")
-    assert (outcome.code, outcome.err) == (0, "")
-    assert json.loads(outcome.out) == report_of("out/report.json")
-    assert [path.name for path in tmp_path.iterdir()] == ["out"]
-    assert shell("verify out").code == 0
-
-
-@pytest.mark.parametrize("more", ["", " --quiet", " -v"])
-def test_of_a_dry_run_as_well(shell: Shell, tmp_path: Path, more: str) -> None:
-    outcome = shell(f"convert {CAPTURE} --rig {RIG} --dry-run --report -{more}")
-    assert json.loads(outcome.out)["schema"] == "mlbatch.report/1"
-    assert list(tmp_path.iterdir()) == []
-
-
 def test_a_line_for_each_segment(shell: Shell, tmp_path: Path) -> None:
     write_session(tmp_path, Unit(turns=40))
     words = "--fault jump:ouster_111:37s@2s --on-jump split --report -"
@@ -82,18 +65,6 @@ def test_a_line_for_each_segment(shell: Shell, tmp_path: Path) -> None:
     assert len(starts) == 2
     assert starts[1] - starts[0] > 37 * NS_PER_S
     assert reports == [report_of(f"out.seg{n}/report.json") for n in (1, 2)]
-
-
-def test_a_printed_rig_is_one_that_can_be_read(shell: Shell, tmp_path: Path) -> None:
-    outcome = shell(f"inspect {CAPTURE} --write-rig -")
-    assert outcome.code == 0
-    assert list(tmp_path.iterdir()) == []
-    (tmp_path / "rig.yaml").write_text(outcome.out)
-    rig = read_rig(tmp_path / "rig.yaml")
-    assert [sensor.name for sensor in rig.sensors] == [
-        "ouster_122647000123",
-        "ouster_122648000456",
-    ]
 
 
 def _stdin(monkeypatch: pytest.MonkeyPatch, text: str) -> None:
