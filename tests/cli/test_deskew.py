@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from pathlib import Path
 
@@ -166,32 +165,6 @@ def test_boxes_are_of_the_body_where_a_column_was_measured(shell: Shell) -> None
     ):
         assert one["points"] == other["points"]
         assert one["points"]["box"] > 0
-
-
-def test_windows_without_poses_are_left_out_and_counted(shell: Shell) -> None:
-    """A trajectory from 0.25 s after scan 0 to 0.45 s: scan 3 alone is covered."""
-    usual(shell, WORDS)
-    start_ns = int(arrays("usual/000000.npz")["start_ns"])
-    trajectory("short.tum", start_ns / NS + 0.25, start_ns / NS + 0.45, 1.0, 0.0)
-    done = shell(f"convert {CAPTURE} --rig {RIG} -o part --deskew short.tum --deskew-to end")
-    assert done.code == 0
-    count = len(names("usual"))
-    assert f"poses of short.tum; {count - 1} windows without poses left out" in done.out
-    assert names("part") == ["000003.npz"]
-    report = report_of("part/report.json")
-    assert report["deskew"]["windows_without_poses"] == count - 1
-    warned = next(one for one in report["warnings"] if one["code"] == "no_pose")
-    assert f"short.tum has no poses of {count - 1} windows" in warned["message"]
-    assert "warning: no_pose: short.tum has no poses" in done.err
-    for sensor in report["sensors"]:
-        columns = sensor["columns"]
-        assert columns["dropped"]["no_pose"] > 0
-        assert columns["decoded"] == columns["written"] + sum(columns["dropped"].values())
-    verified = shell("verify part --json")
-    assert verified.code == 0
-    checks = {one["name"]: one for one in json.loads(verified.out)["checks"]}
-    assert checks["geometry"]["outcome"] == "not checkable"
-    assert "--deskew" in checks["geometry"]["limit"]
 
 
 @pytest.mark.parametrize("output", ["sets", "sets.mcap", "sets.bag"])

@@ -99,23 +99,6 @@ def test_sets_can_be_checked_and_read(shell: Shell, output: str, times: str) -> 
         assert scan.end_ns > scan.start_ns
 
 
-def test_the_report_says_that_it_is_frame_level_fusion(shell: Shell) -> None:
-    done = shell(f"convert {CAPTURE} --rig {RIG} --batching collate -o out.mcap --html page.html")
-    assert done.code == 0
-    assert "sets of sweeps (0 incomplete), frame-level fusion collate, common times" in done.out
-    report = report_of("out.mcap.report.json")
-    assert report["grid"]["batching"] == "collate"
-    assert report["grid"]["batching_times"] == "common"
-    for sensor in report["sensors"]:
-        columns = sensor["columns"]
-        assert set(columns["dropped"]) <= {"part_sweep", "no_set", "before_start"}
-        again = columns.get("reused", 0)
-        assert columns["decoded"] + again == columns["written"] + sum(columns["dropped"].values())
-    with Path("out.mcap").open("rb") as file:
-        grid = next(one for one in make_reader(file).iter_metadata() if one.name == "mlbatch.grid")
-    assert grid.metadata["batching"] == "collate"
-
-
 def test_reused_columns_are_counted(shell: Shell) -> None:
     """The slower one repeats a sweep once in 20 s, seen from the faster one."""
     capture = write_case(Path("case"), "10.00 Hz with 9.95 Hz")

@@ -11,7 +11,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mlbatch.errors import RecordingError
 from mlbatch.reports.ledger import SensorLedger, check_capture
 from mlbatch.reports.report import (
     ClockReport,
@@ -25,7 +24,6 @@ from mlbatch.reports.report import (
     imbalances,
     report_of,
     report_text,
-    summary_lines,
 )
 from mlbatch.reports.scan_table import ScanTable
 from mlbatch.types import CaptureCounts
@@ -165,14 +163,6 @@ def test_table_of_scans_by_hand() -> None:
     assert len(rows) == 3
 
 
-def test_the_text_may_be_read_before_the_last_scan() -> None:
-    table = ScanTable(run_info())
-    table.add(dense_scan(0))
-    assert table.text().count("\n") == 2
-    table.add(dense_scan(1))
-    assert table.text().count("\n") == 3
-
-
 def test_sensors_of_one_window_share_a_row() -> None:
     left = replace(dense_scan(points=2, columns=4), columns_per_sensor=(4, 0), max_gap_ns=(8, 0))
     left = replace(left, coverage=(0.75, 0.0), overlap=(0.25, 0.0))
@@ -216,11 +206,6 @@ def test_statistics_by_hand() -> None:
     assert (found.written, found.empty, found.incomplete, found.points) == (4, 1, 1, 40)
     assert (found.span_ms.p50, found.span_ms.p99, found.span_ms.max) == (98.0, 98.0, 98.0)
     assert (found.period_ms.p50, found.period_ms.max) == (100.0, 100.0)
-
-
-def test_statistics_of_nothing_are_null() -> None:
-    found = ScanTable(run_info()).statistics(empty=0)
-    assert (found.written, found.span_ms.p50, found.period_ms.max) == (0, None, None)
 
 
 def test_report_has_the_contract_s_form() -> None:
@@ -282,17 +267,6 @@ def test_names_that_are_no_text_come_back() -> None:
     assert json.loads(text.encode("utf-8"))["inputs"][0]["path"] == name
 
 
-def test_summary_names_sensors_scans_and_warnings() -> None:
-    lines = summary_lines(run())
-    assert lines[0].split() == [
-        *("sensor", "model", "packets", "lost", "rejected", "columns", "dropped", "points")
-    ]
-    assert lines[1].split() == ["left", "OS1-4", "110", "4", "10", "1500", "100", "4500"]
-    assert lines[2] == "2 scans at 10 Hz (1 incomplete, 3 empty windows), 2000 points, clock utc"
-    assert "5.0 x real time" in lines[3]
-    assert lines[4] == "warning loss: 4 packets lost"
-
-
 # -- read back ------------------------------------------------------------------------------------
 
 
@@ -313,16 +287,3 @@ def test_what_a_report_lacks_is_empty() -> None:
     assert found.sensors[0].ledger == SensorLedger()
     assert found.sensors[0].body_from_sensor.shape == (0,)
     assert (found.scans.written, found.timing, found.recorded_s) == (0, None, 0.0)
-
-
-@pytest.mark.parametrize(
-    ("text", "expected"),
-    [
-        ("[", "expected a report in JSON, found"),
-        ("[]", "expected a report of schema mlbatch.report/1, found 'none'"),
-        ('{"schema": "x"}', "expected a report of schema mlbatch.report/1, found 'x'"),
-    ],
-)
-def test_another_document_is_no_report(text: str, expected: str) -> None:
-    with pytest.raises(RecordingError, match=f"r.json: {expected}"):
-        report_of("r.json", text)
