@@ -93,32 +93,6 @@ def test_reflectivity_is_the_intensity_of_8_bits(shell: Shell, tmp_path: Path, j
     assert shell("verify out.mcap").code == 0
 
 
-@pytest.mark.parametrize("split", ["", " --split"])
-@pytest.mark.parametrize("layout", ["dense", "organized"])
-def test_clipped_points_are_counted(shell: Shell, tmp_path: Path, split: str, layout: str) -> None:
-    """Of 10 points a sweep two are above 255 and one is below 0; 255 itself is none of them."""
-    _clouds(tmp_path, [0, 1, 255, 256, -1, 17, 18, 19, 4000, 20])
-    common = f"convert drive.mcap --keep-partial --layout {layout}{split}"
-    outcome = shell(f"{common} -o out.mcap --point-layout autoware")
-    assert outcome.code == 0, outcome.err
-    (sensor,) = report_of("out.mcap.report.json")["sensors"]
-    assert sensor["points"]["written"] == 100
-    assert sensor["points"]["clipped"] == 30
-    assert "clipped" in outcome.warnings
-    assert "30 of 100 points (30.00%)" in outcome.err
-    assert shell("verify out.mcap").code == 0
-    # Layouts with float32 intensities clip nothing.
-    outcome = shell(f"{common} -o float.mcap")
-    assert report_of("float.mcap.report.json")["sensors"][0]["points"]["clipped"] == 0
-    assert "clipped" not in outcome.warnings
-
-
-def test_a_dry_run_counts_them_for_the_layout(shell: Shell, tmp_path: Path) -> None:
-    _clouds(tmp_path, [0, 256])
-    outcome = shell("convert drive.mcap --keep-partial --dry-run --point-layout autoware")
-    assert '"clipped": 10' in outcome.out
-
-
 def test_a_resumed_run_counts_those_of_the_scans_before(
     shell: Shell, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -147,17 +121,6 @@ def test_a_resumed_run_counts_those_of_the_scans_before(
     for path in files:
         found = Path("out", path.name.replace("whole", "out"))
         assert found.read_bytes() == path.read_bytes()
-
-
-def test_with_strict_clipping_is_an_error(shell: Shell, tmp_path: Path) -> None:
-    # Points to the end of a sweep, as of a driver that publishes it then.
-    _clouds(tmp_path, [0.0] * 9 + [256.0])
-    outcome = shell(
-        "convert drive.mcap -o out.mcap --keep-partial --point-layout autoware --strict"
-    )
-    assert outcome.code == 1
-    assert "clipped, an error because of --strict" in outcome.err
-    assert not (tmp_path / "out.mcap").exists()
 
 
 def test_a_mixed_rig_takes_what_each_sensor_has() -> None:

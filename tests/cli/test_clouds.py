@@ -227,6 +227,12 @@ def _stepping(step: int) -> list[Recorded]:
     return _bag([cloud_message(OUSTER, _sweep(OUSTER, NS), start) for start in starts])
 
 
+def _of_intensities(values: list[float]) -> list[Recorded]:
+    """Sweeps with a point of every intensity, in turn."""
+    points = [(3, 1, 0.5, v, n * SWEEP // len(values), n % 4) for n, v in enumerate(values)]
+    return _bag([cloud_message(OUSTER, points, start) for start in _starts()])
+
+
 def _placed() -> list[Recorded]:
     """One of two lidars is in a frame of the recording."""
     edge = ("base_link", "one", (7.0, 7.0, 7.0), (0.0, 0.0, 0.0, 1.0))
@@ -304,6 +310,10 @@ RECORDINGS: dict[str, list[Recorded]] = {
     "undistorted": _bag(SEEN, "/boxi/hesai/points_undistorted"),
     "rectified": _bag(SEEN, "/sensing/lidar/top/rectified/pointcloud"),
     "deskewed": _bag(SEEN, "/lidar/deskewed"),
+    # Of ten points two are above 255 and one is below 0; 255 itself is none of them.
+    "bright": _of_intensities([0, 1, 255, 256, -1, 17, 18, 19, 4000, 20]),
+    # Points to the end of a sweep, as of a driver that publishes it then.
+    "last_bright": _of_intensities([0] * 9 + [256]),
     # Several lidars, by their frames, numbers or topics.
     "two_frames": _two_frames(),
     "late_frame": _late_frame(),
