@@ -245,7 +245,7 @@ def check_names(call: str, options: Mapping[str, object], *tables: type) -> None
             close = difflib.get_close_matches(name, known, 1)
             remedy = f"write {close[0]}, or see" if close else "see"
             raise UsageError(
-                f"{call}: expected an option of `mlbatch convert` that it has, found {name!r}; "
+                f"{call}: expected an option of this function, found {name!r}; "
                 f"{remedy} docs/python.md"
             )
 
