@@ -75,7 +75,7 @@ class PairFigures(NamedTuple):
         if self.outcome == OFF:
             found = f"double walls: {self.lidars[-1]} is {self._found()} off"
         elif not self.is_within(_SHOWN):
-            found = f"they are not proven to be apart: {self._found(with_sigma=True)}"
+            found = f"they are not significantly apart: {self._found(with_sigma=True)}"
         else:
             found = f"they agree within {_bounds([self])}"
         text = f"{seen}; {found}"
@@ -153,7 +153,7 @@ class PoseFigures(NamedTuple):
             return "poses are wrong"
         text = f"surfaces agree within {_bounds(known)}"
         if not all(pair.is_within(_SHOWN) for pair in known):
-            text = "poses: neither proven to be right nor wrong"
+            text = "poses: neither confirmed nor refuted"
         elif any(pair.undetermined for pair in known):
             text += " in the directions that the scene determines"
         if len(known) < len(self.pairs):

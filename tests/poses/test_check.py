@@ -222,8 +222,9 @@ PAIR = PairFigures(("left", "right"), MEASURED, "", 3, 90, 41.2, 100.0, 6.0, 1.0
         ),
         (
             PAIR._replace(shift_mm=17.0, turn_deg=0.5, turn_deviation_deg=0.08),
-            "left and right have 41 % of their surfaces in common; they are not proven to be "
-            "apart: 17 mm (standard deviation 1 mm) / 0.50 degrees (standard deviation 0.08)",
+            "left and right have 41 % of their surfaces in common; they are not "
+            "significantly apart: 17 mm (standard deviation 1 mm) / 0.50 degrees "
+            "(standard deviation 0.08)",
         ),
         (
             PAIR._replace(shift_mm=None, undetermined=("shift along x",)),
@@ -251,7 +252,7 @@ def test_a_verdict_says_what_it_covers() -> None:
     )
     open_pair = PAIR._replace(turn_deg=0.3)
     assert PoseFigures(pairs=(PAIR, open_pair)).describe() == (
-        "poses: neither proven to be right nor wrong"
+        "poses: neither confirmed nor refuted"
     )
 
 

@@ -86,8 +86,8 @@ _FITS_LIDAR_PORT = 10
 _FITS_IMU_PORT = 2
 _FITS_SIZE = 1
 _UNPROVEN = (
-    "metadata not proven: packets and metadata have no serial number in common, only packet size "
-    "and mode were compared"
+    "metadata not confirmed: packets and metadata have no serial number in common, only packet "
+    "size and mode were compared"
 )
 # Measurement ids of any mode.
 _ANY_IDS = 1 << 16
