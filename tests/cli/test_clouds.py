@@ -227,7 +227,7 @@ def _stepping(step: int) -> list[Recorded]:
     return _bag([cloud_message(OUSTER, _sweep(OUSTER, NS), start) for start in starts])
 
 
-def _of_intensities(values: list[float]) -> list[Recorded]:
+def _of_intensities(values: Sequence[float]) -> list[Recorded]:
     """Sweeps with a point of every intensity, in turn."""
     points = [(3, 1, 0.5, v, n * SWEEP // len(values), n % 4) for n, v in enumerate(values)]
     return _bag([cloud_message(OUSTER, points, start) for start in _starts()])
