@@ -4,7 +4,8 @@
 #   make test    formatting, lint, types, all tests
 #   make coverage   all tests with branch coverage, at least 95 %
 #   make test-quick   the fast tests, without whole suites of cases
-#   make test-lowest   the same with the oldest dependencies allowed, by Python 3.10 or 3.11
+#   make test-lowest   these and all of readers, writers and ros, with the oldest dependencies
+#                allowed, by Python 3.10 or 3.11
 #   make lint    the first three of them
 #   make docs    the documentation as a site, build/site/index.html
 #   make bench   how fast it is here (BENCH="--case dual-4 --peer-python PYTHON")
@@ -57,7 +58,7 @@ test-quick: $(VENV)/dev.stamp
 	$(BIN)/python -m pytest -n 2 --dist worksteal -m 'not slow and not long and not seconds'
 
 test-lowest: $(LOWEST)/dev.stamp
-	$(LOWEST)/bin/python -m pytest -n 2 --dist worksteal -m 'not slow and not long'
+	$(LOWEST)/bin/python -m pytest -n 2 --dist worksteal -m lowest
 
 # PCL, CloudCompare, Open3D: apt-get install pcl-tools cloudcompare libusb-1.0-0; JavaScript: node, npm.
 test-consumers: $(VENV)/dev.stamp

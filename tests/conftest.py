@@ -22,8 +22,8 @@ settings.load_profile("mlbatch")
 if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
-# Whole suites of cases: `make test-quick` and `make test-lowest` leave them
-# out; who works on their subject names them: `pytest tests/verification`.
+# Whole suites of cases: `make test-quick` leaves them out; who works on their subject names them:
+# `pytest tests/verification`.
 LONG = (
     "batch/",
     "bench/",
@@ -144,6 +144,9 @@ SECONDS = (
     "writers/test_voxel_filter.py",
 )
 
+# Where the versions of dependencies matter most: `make test-lowest` runs all of these, and the
+# tests of `make test-quick`.
+LOWEST = ("readers/", "ros/", "writers/")
 # Conversions of other tests do not compare what lidars see, which is half of the time of those as
 # short as theirs.
 POSES = (
@@ -156,10 +159,14 @@ POSES = (
 )
 
 
+def _paths(entries: tuple[str, ...]) -> tuple[str, ...]:
+    return tuple(f"tests/{entry}" for entry in entries)
+
+
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_protocol(item: pytest.Item) -> Generator[None, object, object]:
     """Check poses in the tests that are about it alone, their shared fixtures included."""
-    if item.nodeid.startswith(tuple(f"tests/{entry}" for entry in POSES)):
+    if item.nodeid.startswith(_paths(POSES)):
         return (yield)
     with patch.object(PoseCheck, "add", lambda check, window: None):
         return (yield)
@@ -180,12 +187,19 @@ def pytest_collection() -> Iterator[None]:
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Mark the tests of long suites, and those that take seconds."""
+    """Mark the tests of long suites, those that take seconds, and those of `make test-lowest`."""
     for mark, entries in ((pytest.mark.long, LONG), (pytest.mark.seconds, SECONDS)):
-        starts = tuple(f"tests/{entry}" for entry in entries)
+        starts = _paths(entries)
         for item in items:
             if item.nodeid.startswith(starts):
                 item.add_marker(mark)
+    starts = _paths(LOWEST)
+    for item in items:
+        marks = {mark.name for mark in item.iter_markers()}
+        if "slow" not in marks and (
+            not marks & {"long", "seconds"} or item.nodeid.startswith(starts)
+        ):
+            item.add_marker(pytest.mark.lowest)
 
 
 @pytest.fixture

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.conftest import LONG, SECONDS
+from tests.conftest import LONG, LOWEST, POSES, SECONDS
 from tests.contract.tree import PACKAGE, ROOT, Module, modules, plugins
 
 MODULES = modules()
@@ -112,7 +112,7 @@ def test_every_folder_of_the_package_is_a_package() -> None:
         assert (path.parent / "__init__.py").is_file(), path.parent
 
 
-@pytest.mark.parametrize("entry", [*LONG, *SECONDS])
+@pytest.mark.parametrize("entry", [*LONG, *LOWEST, *POSES, *SECONDS])
 def test_long_suites_are_there(entry: str) -> None:
     """A folder or file that has moved would be back in `make test-quick`."""
     place, _, function = entry.partition("::")
