@@ -111,12 +111,11 @@ def test_a_drive_along_x_moves_points_by_speed_times_time(shell: Shell, to: str)
         "--batching collate --batching-times own",
     ],
 )
-@pytest.mark.parametrize("words", [WORDS, MIXED])
-def test_every_vendor(shell: Shell, words: str, options: str) -> None:
+def test_every_vendor(shell: Shell, options: str) -> None:
     """A turn to the left at 1 rad/s with 5 m/s: the same bytes by three jobs."""
-    begin_s = usual(shell, words)
+    begin_s = usual(shell, MIXED)
     trajectory("turn.tum", begin_s, begin_s + 5, 5.0, 1.0)
-    line = f"{words} {options}"
+    line = f"{MIXED} {options}"
     assert shell(f"{line} -o still").code == 0
     assert shell(f"{line} -o moved --deskew turn.tum").code == 0
     assert shell(f"{line} -o jobs --deskew turn.tum --jobs 3").code == 0

@@ -34,7 +34,7 @@ def check(folder: Path, text: str, least_points: int = 3000, suffix: str = "pcap
 @pytest.mark.parametrize("model", MODELS)
 def test_points_lie_on_the_scene(model: str, tmp_path: Path) -> None:
     profile = "    profile: RNG15_RFL8_NIR8\n" if model in OUSTER else ""
-    check(tmp_path, scenario_text(LIDAR.format(model=model, noise=0) + profile))
+    check(tmp_path, scenario_text(LIDAR.format(model=model, noise=0) + profile, duration=0.12))
 
 
 @pytest.mark.parametrize("profile", PROFILES)
@@ -48,7 +48,7 @@ def test_points_of_every_profile_lie_on_the_scene(profile: str, tmp_path: Path) 
 )
 def test_points_of_every_mode_lie_on_the_scene(model: str, mode: str, tmp_path: Path) -> None:
     lines = LIDAR.format(model=model, noise=0) + f"    mode: {mode}\n"
-    check(tmp_path, scenario_text(lines), 1000)
+    check(tmp_path, scenario_text(lines, duration=0.12), 500)
 
 
 @pytest.mark.parametrize("suffix", ["mcap", "db3"])
