@@ -3,13 +3,21 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
+from mlbatch.pipeline.contents import recording_report
+from mlbatch.readers import open_recording
 from mlbatch.simulate.velodyne.encode import VelodyneSpec
+from mlbatch.types import StreamTable
+from tests.builders.bags import Body, Recorded, fixture_messages
 from tests.builders.captures import udp_frame
+from tests.builders.mcaps import write_mcap
+from tests.builders.rosbag1 import write_rosbag1
+from tests.builders.rosbag2 import write_rosbag2
 from tests.builders.sessions import (
     FIXTURE,
     NS_PER_MS,
@@ -21,6 +29,7 @@ from tests.builders.sessions import (
     write_metadata,
     write_session,
 )
+from tests.builders.sessions_of_bags import unit_messages
 from tests.builders.transcripts import transcripts
 from tests.builders.vendor_sessions import framed, lidar_payloads, write_capture
 
@@ -52,6 +61,7 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
     for name, head in (("a.mcap", b"\x89MCAP0\r\n"), ("a.bag", b"#ROSBAG V2.0\n")):
         (folder / name).write_bytes(head + bytes(1 << 20))
     _write_long(folder / "long")
+    _write_bags(folder)
     return folder
 
 
@@ -68,6 +78,30 @@ def _write_long(folder: Path) -> None:
     other = twin(replace(unit, begin_ns=late_ns, turns=10), 222)
     write_session(folder, more=[*kept, *foreign, *other.records])
     write_metadata(folder / "111.json", SMALL)
+
+
+def _write_bags(folder: Path) -> None:
+    """A lidar, and /note with 20 messages a second from its first packet to its last."""
+    for name in ("notes", "cut", "split"):
+        (folder / name).mkdir()
+    for turns in (120, 130):
+        sent = unit_messages(Unit(turns=turns), "top")
+        first_ns = sent[0].log_ns
+        notes = [
+            Recorded("/note", "std_msgs/String", first_ns + at * 50 * NS_PER_MS, _text(at))
+            for at in range(turns * 2)
+        ]
+        if turns == 130:
+            write_mcap(folder / "split" / "drive.mcap", sent)
+            write_mcap(folder / "split" / "notes.mcap", notes)
+            continue
+        whole = sorted([*sent, *notes], key=lambda message: message.log_ns)
+        data = write_mcap(folder / "notes" / "drive.mcap", whole).read_bytes()
+        (folder / "cut" / "drive.mcap").write_bytes(data[: len(data) * 95 // 100])
+
+
+def _text(number: int) -> bytes:
+    return Body("cdr").text(str(number)).done()
 
 
 @pytest.mark.parametrize("name", CASES)
@@ -95,3 +129,21 @@ def test_loss_is_that_of_a_conversion(shell: Shell, tmp_path: Path, whole: str) 
     assert sensor["packets"]["rejected"] == {"bad_stamp": 1, "duplicate": 1}
     # The damaged packet is missing, too, where packets are counted by their timestamps.
     assert stream["lost"] == sensor["packets"]["lost"] == len(lost) + 1
+
+
+@pytest.mark.parametrize(
+    ("name", "encoding", "write"),
+    [
+        ("drive.mcap", "cdr", write_mcap),
+        ("drive.db3", "cdr", write_rosbag2),
+        ("drive.bag", "ros1", write_rosbag1),
+    ],
+)
+def test_the_index_of_a_bag_states_its_end(
+    tmp_path: Path, name: str, encoding: str, write: Callable[[Path, Sequence[Recorded]], Path]
+) -> None:
+    messages = fixture_messages(encoding)
+    bag = write(tmp_path / name, messages)
+    recording = open_recording(bag, StreamTable())
+    assert recording.last_ns == max(one.log_ns for one in messages)
+    assert recording_report(recording).last_host_ns == recording.last_ns
