@@ -292,7 +292,7 @@ CONVERT: Final = (
         Option(
             "compression",
             TEXT,
-            "Of MCAP chunks: none, lz4, zstd, or zstd:LEVEL from 1 to 22 (zstd: 1).",
+            "Compression of MCAP chunks: none, lz4, zstd, or zstd:LEVEL from 1 to 22 (zstd: 1).",
             default="none",
             metavar="NAME",
             words=COMPRESSIONS,
@@ -305,8 +305,14 @@ CONVERT: Final = (
             metavar="MAP",
             in_rig=False,
         ),
-        Option("voxel", NUMBER, "Of the map: one point per cube, m.", metavar="M", in_rig=False),
-        Option("crs", TEXT, "Of the map: its system.", metavar="EPSG:N", in_rig=False),
+        Option(
+            "voxel",
+            NUMBER,
+            "Map with one point per cube of this edge, m.",
+            metavar="M",
+            in_rig=False,
+        ),
+        Option("crs", TEXT, "Coordinate system of the map.", metavar="EPSG:N", in_rig=False),
         Option(
             "report",
             PATH,

@@ -66,14 +66,14 @@ def batch(
     ] = None,
     disk_limit: Annotated[
         str | None,
-        typer.Option(help="Most disk of a session: 50 GB. [default: manifest's]"),
+        typer.Option(help="Largest disk use of a session: 50 GB. [default: manifest's]"),
     ] = None,
     plan: Annotated[
         bool,
         typer.Option("--plan", help="Print sessions, bytes and hours; keep nothing on disk."),
     ] = False,
     names: Annotated[
-        bool, typer.Option("--list", help="Print the names of the sessions, a line each.")
+        bool, typer.Option("--list", help="Print the names of the sessions, one per line.")
     ] = False,
     fail_fast: Annotated[
         bool, typer.Option("--fail-fast", help="After the first failure begin no other session.")

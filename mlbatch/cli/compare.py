@@ -43,7 +43,7 @@ def compare(
     speed: Annotated[
         str | None,
         typer.Option(
-            help="Of an object on the page, m/s.  [default: 10]",
+            help="Speed of an object on the page, m/s.  [default: 10]",
             metavar="M/S",
             show_default=False,
         ),

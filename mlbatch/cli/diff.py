@@ -22,7 +22,8 @@ def diff(
     ],
     b: Annotated[str, typer.Argument(metavar="B", help="Output to compare with it.")],
     tolerance: Annotated[
-        float, typer.Option(help="Of reals (coordinates and ranges in m, intensities).")
+        float,
+        typer.Option(help="Allowed difference of coordinates and ranges (m) and intensities."),
     ] = 0.0,
     as_json: AsJson = False,
 ) -> None:

@@ -117,7 +117,7 @@ def progress_bar(
 
 @contextlib.contextmanager
 def stage_lines(name: str, *, is_shown: bool = True) -> Iterator[None]:
-    """Print what a logger says, a line each, as `mlbatch: name: ...`."""
+    """Print records of a logger, one per line, as `mlbatch: name: ...`."""
     logger, handler = logging.getLogger(f"mlbatch.{name}"), logging.Handler()
     handler.emit = lambda record: typer.echo(  # type: ignore[method-assign]
         f"mlbatch: {name}: {record.getMessage()}", err=True

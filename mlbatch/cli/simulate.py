@@ -24,7 +24,7 @@ def simulate(
     ] = None,
     seed: Annotated[
         int | None,
-        typer.Option(min=0, max=2**32 - 1, help="Of all noise. [default: the scenario's]"),
+        typer.Option(min=0, max=2**32 - 1, help="Seed of all noise. [default: the scenario's]"),
     ] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace existing files.")] = False,
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Print nothing.")] = False,

@@ -436,8 +436,8 @@ def _refuse_same_packets(table: StreamTable, found: Sequence[DetectedSensor], or
             shared = sorted(one.kinds & other.kinds)
             if shared and not apart:
                 raise RigError(
-                    f"{origin}: sensors {other.name} and {one.name}: expected a stream each, found "
-                    f"{table.streams[shared[0].stream]} for both; name the stream of each "
+                    f"{origin}: sensors {other.name} and {one.name}: expected one stream each, "
+                    f"found {table.streams[shared[0].stream]} for both; name the stream of each "
                     "(source_ip, port, topic or serial)"
                 )
 

@@ -57,7 +57,7 @@ Row: TypeAlias = tuple[object, ...]
 def grown(
     forest: Forest, seed: Sequence[int], way_m: F64Array, terrain: Terrain | None
 ) -> tuple[list[Row], list[Row]]:
-    """Return the values of Stems and of Crowns, a row each; way_m: (n, 3)."""
+    """Return the values of Stems and of Crowns, one row per plant; way_m: (n, 3)."""
     x0, y0, x1, y1 = forest.area_m
     random = np.random.default_rng(seed)
     count = round(forest.per_hectare * (x1 - x0) * (y1 - y0) / _M2_PER_HECTARE)
