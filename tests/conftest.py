@@ -155,6 +155,7 @@ POSES = (
     "golden/test_digests.py",
     "page/",
     "pipeline/test_inspect.py",
+    "pipeline/test_resume.py::test_a_complete_output",
     "python/",
 )
 
