@@ -25,6 +25,8 @@ LOWEST := .venv-lowest
 CONSUMERS := .venv-consumers
 ODOMETRY := .venv-odometry
 BIN := $(VENV)/bin
+# Types by the oldest Python, where the installed numpy has types for it: up to 3.11.
+OLDEST = $(shell $(BIN)/python -c 'import sys; print("--python-version 3.10" * (sys.version_info < (3, 12)))')
 # Modules are compiled when they are imported; of most tools few are.
 INSTALL := install --quiet --disable-pip-version-check --no-compile
 RIG := fixtures/two_lidars
@@ -67,7 +69,7 @@ test-consumers: $(VENV)/dev.stamp
 lint: $(VENV)/dev.stamp
 	$(BIN)/ruff format --check
 	$(BIN)/ruff check
-	$(BIN)/mypy
+	$(BIN)/mypy $(OLDEST)
 
 # The variable removes a notice about the next version of mkdocs.
 docs: $(VENV)/docs.stamp

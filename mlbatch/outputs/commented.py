@@ -308,8 +308,7 @@ class PcdReader(CommentedReader):
         if count != width * height or len(data) != begin + count * _POINT.itemsize:
             expected = f"{width} x {height} points of {_POINT.itemsize} bytes"
             raise DamageError(expected, f"{count} points, {len(data) - begin} bytes")
-        points = np.frombuffer(data, _POINT, count, begin)
-        if height != 1:
-            points = points.reshape(height, width).T
+        flat = np.frombuffer(data, _POINT, count, begin)
+        points = flat if height == 1 else flat.reshape(height, width).T
         names = points.dtype.names or ()
         return ScanComments.of_lines(comments), {name: points[name] for name in names}

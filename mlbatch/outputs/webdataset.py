@@ -123,7 +123,9 @@ class SampleReader(NpzReader):
         if not isinstance(found, dict):
             raise DamageError("a JSON object next to the npz", "other bytes")
         own = self.sensors.index(file.sensor) if file.sensor in self.sensors else 0
-        columns = np.bincount(values["column_lidar_id"], minlength=len(self.sensors))
+        columns = np.bincount(
+            values["column_lidar_id"].astype(np.int64), minlength=len(self.sensors)
+        )
         xyz, fill = values["xyz"], values["fill"]
         points = np.isfinite(xyz[..., 0]).sum() if self.organized else len(xyz)
         keys = ("index", "slice", "start_ns", "end_ns", "complete")

@@ -15,8 +15,10 @@ import time
 from dataclasses import dataclass, field
 from itertools import product
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 import yaml
 
 import mlbatch
@@ -139,7 +141,7 @@ def make(folder: Path, scene: str, rig: int) -> None:
     (work / "scenario.yaml").write_text(yaml.safe_dump(scenario(scene, rig)))
     recording = work / "rec.mcap"
     write_recording(read_scenario(str(work / "scenario.yaml")), recording, overwrite=True)
-    stored: dict[str, F64Array] = {}
+    stored: dict[str, npt.NDArray[Any]] = {}
     windows = 0
     scans = mlbatch.scans(recording, rig=work / "rec.rig.yaml", min_range=1.5)
     for windows, scan in enumerate(scans, 1):

@@ -6,6 +6,7 @@ import gzip
 import math
 import multiprocessing
 import pickle
+from collections.abc import Iterator
 from itertools import islice, pairwise
 from pathlib import Path
 from typing import Any
@@ -19,6 +20,7 @@ from mlbatch.errors import RecordingError, RigError, UsageError
 from mlbatch.pipeline.job import Job
 from mlbatch.python.options import output_job, session_job, window_job
 from mlbatch.python.recording import Recording
+from mlbatch.types import PacketBatch
 from tests.builders.run import command
 from tests.builders.sessions import CAPTURE, FIXTURE, RIG, Unit, twin, write_session
 from tests.contract.tree import ROOT
@@ -279,13 +281,14 @@ def test_scans_wait_for_nobody_to_ask(monkeypatch: pytest.MonkeyPatch, rec: Reco
     read: list[int] = []
     from mlbatch.pipeline.session import Session
 
-    count = Session._count
+    packets = Session.packets
 
-    def counted(self: Session, batch: object) -> None:
-        read.append(1)
-        count(self, batch)  # type: ignore[arg-type]
+    def counted(self: Session) -> Iterator[PacketBatch]:
+        for batch in packets(self):
+            read.append(1)
+            yield batch
 
-    monkeypatch.setattr(Session, "_count", counted)
+    monkeypatch.setattr(Session, "packets", counted)
     scans = rec.scans()
     assert read == []
     assert len(list(islice(scans, 1))) == 1

@@ -142,7 +142,7 @@ class VelodyneSpec(SpinningSpec):
         stamp_us = self.table.form.stamp_after_us
         said_us = _stamps_us(self, row_us) + self.hour * HOUR_US
         off_ns = said_us * NS_PER_US - round(stamp_us * NS_PER_US) - first_ns
-        said_ns: I64Array = fires_ns + off_ns.repeat(self.columns_per_packet)[:, None]
+        said_ns: I64Array = fires_ns + np.repeat(off_ns, int(self.columns_per_packet))[:, None]
         return said_ns
 
     def directions(self, columns: int) -> F64Array:
