@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import re
-from pathlib import Path
 
 import pytest
 
@@ -70,42 +69,6 @@ def test_the_page_links_to_the_pages_of_runs(data: Dataset) -> None:
     # No script, and nothing from elsewhere.
     assert "<script" not in text
     assert "http" not in text.replace("http-equiv", "")
-
-
-def test_names_and_lines_are_text(data: Dataset, tmp_path: Path) -> None:
-    folder = tmp_path / "out" / "<b>x"
-    folder.mkdir(parents=True)
-    record = {"schema": "mlbatch.session/1", "name": "x", "state": "failed", "exit_code": 1}
-    record |= {"line": "<script>alert(1)</script>", "key": {}}
-    (folder / "session.json").write_text(json.dumps(record), encoding="utf-8")
-    page = tmp_path / "status.html"
-    assert command("batch-status", tmp_path / "out", "--page", page).code == 0
-    assert "<script" not in page.read_text(encoding="utf-8")
-    assert "&lt;b&gt;x" in page.read_text(encoding="utf-8")
-
-
-@pytest.mark.parametrize("text", ["", "{", "[]", '{"schema": "mlbatch.session/1"}', "null", "7"])
-def test_a_damaged_record_is_an_unfinished_session(text: str, tmp_path: Path) -> None:
-    (tmp_path / "out" / "a").mkdir(parents=True)
-    (tmp_path / "out" / "a" / "session.json").write_text(text, encoding="utf-8")
-    found = command("batch-status", tmp_path / "out")
-    assert (found.code, found.out.splitlines()[-1]) == (
-        *(0, "1 sessions: 0 done, 0 failed, 1 unfinished"),
-    )
-
-
-def test_no_batch_is_one_line(tmp_path: Path) -> None:
-    for path in (tmp_path, tmp_path / "nothing"):
-        found = command("batch-status", path)
-        assert (found.code, found.out) == (1, "")
-        assert len(found.err.splitlines()) == 1
-
-
-def test_another_file_is_not_replaced_by_a_page(data: Dataset, tmp_path: Path) -> None:
-    page = tmp_path / "thesis.html"
-    page.write_text("mine", encoding="utf-8")
-    assert command("batch-status", data.folder / "out", "--page", page).code == 1
-    assert page.read_text(encoding="utf-8") == "mine"
 
 
 def test_a_dataset_has_the_sessions_that_are_done(data: Dataset) -> None:

@@ -5,9 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from mlbatch.errors import MlbatchError
 from mlbatch.outputs.damage import MAX_KEPT, CheckLog
-from mlbatch.verification import CHECKS, VerifyError
+from mlbatch.verification import CHECKS
 from mlbatch.verification.outputs import outcomes
 
 
@@ -43,8 +42,3 @@ def test_long_values_are_cut() -> None:
     log.fail("grid", "here", "x" * 1000, "a\nb")
     assert len(log.violations[0].expected) == 160
     assert log.violations[0].found == "a b"
-
-
-def test_the_error_is_one_of_mlbatch() -> None:
-    with pytest.raises(MlbatchError):
-        raise VerifyError("nothing to check")
