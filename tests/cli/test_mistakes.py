@@ -31,7 +31,9 @@ MISTAKES = transcripts("files")
 REAL_MISTAKES = transcripts("recordings")
 URLS = transcripts("urls")
 SESSIONS = transcripts("sessions")
-OPTIONS = transcripts("options", FIX="fix/two_lidars.pcap --rig fix/rig.yaml")
+FIX = "fix/two_lidars.pcap --rig fix/rig.yaml"
+OPTIONS = transcripts("options", FIX=FIX)
+RUNS = transcripts("runs", FIX=FIX)
 UPTIME = Unit(begin_ns=1000 * NS_PER_S, host_ns=EPOCH_NS - 1000 * NS_PER_S)
 
 
@@ -210,6 +212,12 @@ def test_session(monkeypatch: pytest.MonkeyPatch, place: Path, tmp_path: Path, n
 def test_options(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, name: str) -> None:
     (tmp_path / "fix").symlink_to(FIXTURE)
     OPTIONS[name].check(Shell(monkeypatch, tmp_path), tmp_path)
+
+
+@pytest.mark.parametrize("name", RUNS)
+def test_runs(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, name: str) -> None:
+    (tmp_path / "fix").symlink_to(FIXTURE)
+    RUNS[name].check(Shell(monkeypatch, tmp_path), tmp_path)
 
 
 @pytest.mark.skipif(not RECORDINGS.is_dir(), reason=NO_RECORDINGS)
