@@ -52,7 +52,6 @@ def test_a_pipe_among_the_scans_is_damage(shell: Shell, output: str) -> None:
     os.mkfifo(first)
     with pytest.raises(RecordingError, match="found a pipe"):
         list(mlbatch.read(output))
-    assert shell(f"verify {output}").code == 1
     assert shell(f"batch {first} -o sessions").code == 3
 
 
@@ -75,16 +74,6 @@ def test_an_archive_that_unpacks_to_a_thousand_times_its_size(shell: Shell, outp
     for command in (f"digest {output}", f"diff {output} {output}"):
         outcome = shell(command)
         assert (outcome.code, limit in outcome.err) == (1, True)
-
-
-def test_a_report_with_nan(shell: Shell, output: str) -> None:
-    path = Path(output) / "report.json"
-    path.write_text(path.read_text().replace('"rate_hz": "10"', '"rate_hz": NaN'))
-    for command in (f"digest {output}", f"report {output}", f"verify {output}"):
-        outcome = shell(command)
-        assert outcome.code == 1
-        assert "NaN, which is no number of JSON" in outcome.err
-        assert len(outcome.err.splitlines()) == 1
 
 
 # -- disks ------------------------------------------------------------------------------------

@@ -1,4 +1,4 @@
-"""Mistakes of users: one line with what, where, expected, found and the remedy; no traceback."""
+"""Mistakes of users: one line with what, where, expected, found, the remedy; and what runs print."""
 
 from __future__ import annotations
 
