@@ -1,4 +1,4 @@
-"""Mistakes of users: one line with what, where, expected, found, the remedy; and what runs print."""
+"""Mistakes of users, each one line with its remedy, and what runs print."""
 
 from __future__ import annotations
 
