@@ -16,27 +16,39 @@ enum { MOST_RUNS = 512 };
 
 /* -- reading ----------------------------------------------------------------------------------- */
 
-/* Numbers of one type that are `step` bytes apart, as float32. */
-#define READ(type) \
-    for (int64_t point = 0; point < count; point++) { \
+#define AS_REAL(type) \
+    { \
         type value; \
-        memcpy(&value, from + point * step, sizeof value); \
-        out[point] = (float)value; \
+        memcpy(&value, from, sizeof value); \
+        return (float)value; \
     }
 
-static void read_reals(const uint8_t *from, int64_t step, int64_t type, int64_t count, float *out)
+/* A number of any type as float32; 0 of none. */
+static inline float real_of(const uint8_t *from, int64_t type)
 {
     switch (type) {
-    case INT8: READ(int8_t) break;
-    case UINT8: READ(uint8_t) break;
-    case INT16: READ(int16_t) break;
-    case UINT16: READ(uint16_t) break;
-    case INT32: READ(int32_t) break;
-    case UINT32: READ(uint32_t) break;
-    case FLOAT32: READ(float) break;
-    case FLOAT64: READ(double) break;
-    default: memset(out, 0, (size_t)count * sizeof *out);
+    case INT8: AS_REAL(int8_t)
+    case UINT8: AS_REAL(uint8_t)
+    case INT16: AS_REAL(int16_t)
+    case UINT16: AS_REAL(uint16_t)
+    case INT32: AS_REAL(int32_t)
+    case UINT32: AS_REAL(uint32_t)
+    case FLOAT32: AS_REAL(float)
+    case FLOAT64: AS_REAL(double)
+    default: return 0;
     }
+}
+
+/* Numbers of one type that are `step` bytes apart. */
+static void read_reals(const uint8_t *from, int64_t step, int64_t type, int64_t count, float *out)
+{
+    /* With a constant type the compiler leaves out the branches. */
+    if (type == FLOAT32)
+        for (int64_t point = 0; point < count; point++)
+            out[point] = real_of(from + point * step, FLOAT32);
+    else
+        for (int64_t point = 0; point < count; point++)
+            out[point] = real_of(from + point * step, type);
 }
 
 /* Fields of 1, 2, 4 or 8 bytes that are `step` bytes apart; chosen: which points, or NULL. */
@@ -244,13 +256,6 @@ static int insert_number(Times *all, int64_t at)
     return 1;
 }
 
-static inline float real_at(const uint8_t *from)
-{
-    float value;
-    memcpy(&value, from, sizeof value);
-    return value;
-}
-
 /* Number the times of all points: most are the last one, or the one after it, also of shots without
    a place; these say which times there are, too: most are known after the first run. Return 0 for an
    unusual cloud. */
@@ -269,9 +274,9 @@ static inline float real_at(const uint8_t *from)
         int64_t placed = 0, found = 0; \
         for (int64_t point = 0; point < count; point++, row += step) { \
             __builtin_prefetch(row + FETCHED); \
-            const float x = real_at(row + x_at); \
-            const float y = real_at(row + y_at); \
-            const float z = real_at(row + z_at); \
+            const float x = real_of(row + x_at, FLOAT32); \
+            const float y = real_of(row + y_at, FLOAT32); \
+            const float z = real_of(row + z_at, FLOAT32); \
             const float squared = x * x + y * y + z * z; \
             type time; \
             memcpy(&time, row + time_at, sizeof time); \
@@ -401,32 +406,6 @@ typedef struct {
 enum { X_AT, Y_AT, Z_AT, INTENSITY_AT, RING_AT, TYPE_AT, TAG_AT };
 enum { PACKET_HEAD = 24 };
 
-/* An intensity that is no finite number is 0. */
-#define AS_REAL(type) \
-    { \
-        type value; \
-        memcpy(&value, from, sizeof value); \
-        found = (float)value; \
-        break; \
-    }
-
-static inline float intensity_at(const uint8_t *from, int64_t type)
-{
-    float found = 0;
-    switch (type) {
-    case INT8: AS_REAL(int8_t)
-    case UINT8: AS_REAL(uint8_t)
-    case INT16: AS_REAL(int16_t)
-    case UINT16: AS_REAL(uint16_t)
-    case INT32: AS_REAL(int32_t)
-    case UINT32: AS_REAL(uint32_t)
-    case FLOAT32: AS_REAL(float)
-    case FLOAT64: AS_REAL(double)
-    default: break;
-    }
-    return found - found == 0.0f ? found : 0.0f;
-}
-
 /* Write the points from `*next` on to the columns below `end`; columns do not fall up to `stop`.
    Return how many, -1 where a ring is not below `slots`. */
 static inline int64_t fill_run(const Fill *fill, int64_t *next, int64_t stop, int64_t end,
@@ -457,7 +436,9 @@ static inline int64_t fill_run(const Fill *fill, int64_t *next, int64_t stop, in
         memcpy(axes, row + x_at, 4);
         memcpy(axes + 1, row + y_at, 4);
         memcpy(axes + 2, row + z_at, 4);
-        const float intensity = intensity_at(row + intensity_byte, intensity_type);
+        /* An intensity that is no finite number is 0. */
+        const float stored = real_of(row + intensity_byte, intensity_type);
+        const float intensity = stored - stored == 0.0f ? stored : 0.0f;
         memcpy(slot, axes, 4);
         memcpy(slot + plane, axes + 1, 4);
         memcpy(slot + 2 * plane, axes + 2, 4);

@@ -55,8 +55,10 @@ class Struct(ctypes.Structure):
             place = address(value)
         elif isinstance(value, ctypes.Structure | ctypes.Array):
             place = ctypes.addressof(value)
+        kept = vars(self).setdefault("kept", {})
+        kept.pop(name, None)
         if place is not value:
-            vars(self).setdefault("kept", {})[name] = value
+            kept[name] = value
         super().__setattr__(name, place)
 
 
