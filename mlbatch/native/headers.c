@@ -1,8 +1,7 @@
 /* Headers of packets to columns, packet by packet: `lidar/headers.py`.
 
-   A layout describes the packets of a lidar by numbers; its fields are those of the tuple of the
-   same name in `lidar/header_table.py`. Numbers of packets are little-endian unless said. Nothing
-   is kept from packet to packet. */
+   A layout describes the packets of a lidar by numbers. Numbers of packets are little-endian unless
+   said. Nothing is kept from packet to packet. */
 #include <string.h>
 
 #include "native.h"
@@ -10,13 +9,6 @@
 enum { MOST_BLOCKS = 64 };
 enum { NS_PER_US = 1000 };
 #define S_PER_DAY INT64_C(86400)
-
-/* Numbers of some bytes of a packet. */
-typedef struct {
-    int64_t first;
-    int64_t bytes;
-    int64_t value;
-} Check;
 
 static inline int64_t short_at(const uint8_t *from)
 {
@@ -79,32 +71,6 @@ static int64_t days_to(int64_t months)
 
 /* -- Ouster: a timestamp and a position in each column ------------------------------------------ */
 
-/* Where packets have their type, serial number and frame number: first byte and bytes of each. */
-typedef struct {
-    int64_t type[2];
-    int64_t serial[2];
-    int64_t frame[2];
-} Form;
-
-typedef struct {
-    int64_t packet_bytes;
-    int64_t columns;
-    int64_t first_column;
-    int64_t column_bytes;
-    int64_t position_at;
-    int64_t status_at;
-    int64_t positions;
-    int64_t form_count;
-    const Form *forms;
-    int64_t packet_type;
-    int64_t serial;
-    int64_t frame_at;
-    int64_t frames;
-    int64_t rank_count;
-    const int64_t *rank;
-    int64_t packets_per_frame;
-} StampedColumns;
-
 static inline int64_t field_at(const uint8_t *packet, const int64_t *field)
 {
     return number_at(packet + field[0], field[1]);
@@ -163,31 +129,6 @@ static void read_stamped(const StampedColumns *layout, const uint8_t *packet, He
 }
 
 /* -- Velodyne: a timestamp in each packet, an azimuth in each block ----------------------------- */
-
-typedef struct {
-    int64_t packet_bytes;
-    int64_t columns;
-    int64_t groups;
-    int64_t blocks_per_group;
-    int64_t block_count;
-    int64_t block_bytes;
-    const int64_t *flags; /* (block_count,) in bytes 0 and 1 */
-    int64_t circle;
-    int64_t widest;
-    int64_t gap_factor;
-    int64_t stamp_at;
-    int64_t period_ns;
-    int64_t clock_offset_ns;
-    int64_t mode_at;
-    const uint8_t *modes; /* (256,) or NULL */
-    const int64_t *start_ns;
-    const double *ahead_ns;
-    double group_ns;
-    double known_speed;
-    double slowest;
-    double tolerance;
-    int64_t follows_rotor;
-} PacedBlocks;
 
 /* The middle one of some numbers, the lower of two. */
 static int64_t middle_of(const int64_t *numbers, int64_t count)
@@ -276,41 +217,6 @@ static void read_paced(const PacedBlocks *layout, const uint8_t *packet, int64_t
 
 /* -- HESAI: a date in each packet, an azimuth in each block ------------------------------------- */
 
-typedef struct {
-    int64_t packet_bytes;
-    int64_t columns;
-    int64_t returns;
-    int64_t first_block;
-    int64_t block_bytes;
-    int64_t azimuth_at; /* of the packet, in the first block */
-    int64_t azimuth_bytes;
-    int64_t circle;
-    int64_t check_count;
-    const Check *checks;
-    int64_t has_flags;
-    int64_t mode_at;
-    const uint8_t *modes; /* (256,) or NULL */
-    int64_t date_at;
-    int64_t us_at;
-    int64_t sequence_at;
-    int64_t sequence_bytes;
-    int64_t operation_at; /* as all of the following: -1 without */
-    int64_t operations;
-    int64_t loop_at;
-    int64_t states_at;
-    int64_t state_count;
-    const int64_t *tables; /* (operations, state_count) */
-    const int64_t *first_ns; /* of each table */
-    int64_t base_ns;
-    const int64_t *step_ns; /* (operations,) */
-    int64_t divisor;
-    int64_t counts_back;
-    int64_t azimuth_ns;
-    int64_t rpm_at;
-    int64_t rpm_is_signed;
-    double turns_per_s; /* of one step of the speed field */
-} DatedGroups;
-
 /* Time of a packet, ns since 1970; clears `is_good` where a date or time is none. */
 static int64_t dated_ns(const DatedGroups *layout, const uint8_t *packet, int64_t *is_good)
 {
@@ -397,33 +303,6 @@ static void read_dated(const DatedGroups *layout, const uint8_t *packet, Header 
 }
 
 /* -- ROBOSENSE: a timestamp in each packet, an azimuth in each row of blocks -------------------- */
-
-typedef struct {
-    int64_t packet_bytes;
-    int64_t columns; /* of a row */
-    int64_t rows;
-    int64_t first_row;
-    int64_t row_bytes;
-    int64_t check_count;
-    const Check *checks;
-    int64_t foreign_count;
-    const Check *foreign; /* of device packets on the same topic */
-    int64_t point_at; /* byte that is 0 in point packets; -1: none */
-    int64_t row_id;
-    int64_t row_id_bytes;
-    int64_t circle;
-    int64_t widest;
-    int64_t time_at;
-    int64_t is_calendar;
-    int64_t counter_at; /* -1: none */
-    int64_t repeats;    /* rows of equal azimuth have equal times */
-    int64_t row_ns;
-    const int64_t *start_ns; /* (columns,) */
-    const double *start_s;   /* (columns,) */
-    double known_speed;      /* azimuths in a s; 0: unknown */
-    double turns;            /* of an azimuth */
-    double following;        /* the same, 0 to ignore the motion of the rotor */
-} TimedRows;
 
 static int64_t timed_ns(const TimedRows *layout, const uint8_t *packet, int64_t *is_good)
 {
@@ -515,19 +394,6 @@ static void read_timed(const TimedRows *layout, const uint8_t *packet, Header *h
 }
 
 /* -- points that follow each other evenly, and packets of one column ---------------------------- */
-
-typedef struct {
-    int64_t packet_bytes;
-    int64_t columns;
-    int64_t check_count;
-    const Check *checks;
-    int64_t stamp_at;
-    int64_t interval_at; /* -1: none */
-    int64_t interval_ns; /* one step of it */
-    int64_t counter_at;  /* -1: none */
-    int64_t ring_at;     /* -1: none */
-    int64_t rings;
-} EvenColumns;
 
 static void read_even(const EvenColumns *layout, const uint8_t *packet, Header *header)
 {

@@ -17,7 +17,7 @@
 #endif
 
 /* To be changed with every change of a struct or of a signature. */
-#define MLBATCH_ABI 17
+#define MLBATCH_ABI 18
 
 #if defined(_WIN32)
 #define EXPORT __declspec(dllexport)
@@ -367,6 +367,159 @@ static inline int64_t difference(int64_t one, int64_t other)
 {
     return (int64_t)((uint64_t)one - (uint64_t)other);
 }
+
+/* -- layouts of packets: what is read of them but pixels (`headers.c`) --------------------------
+
+   Places of numbers are first bytes of the packet, -1 where it has none. */
+
+/* That some bytes of a packet have a little-endian value. */
+typedef struct {
+    int64_t first;
+    int64_t bytes;
+    int64_t value;
+} Check;
+
+/* First byte and bytes of packet type, serial number and frame number. */
+typedef struct {
+    int64_t type[2];
+    int64_t serial[2];
+    int64_t frame[2];
+} Form;
+
+/* Ouster: columns with a timestamp, a position and a status each. A column begins with its
+   timestamp, 8 bytes, ns; its position has 2 bytes; bit 0 of the status is set if it was measured.
+   The number of a packet is its frame number times `packets_per_frame` plus its rank in the frame;
+   it is negative for packets without a rank. */
+typedef struct {
+    int64_t packet_bytes;
+    int64_t columns;
+    int64_t first_column;
+    int64_t column_bytes;
+    int64_t position_at; /* bytes of a column */
+    int64_t status_at;
+    int64_t positions;  /* of a revolution */
+    int64_t form_count; /* 0: columns have the frame number, at `frame_at`, 2 bytes */
+    const Form *forms;  /* the second for packets whose serial number is found by it only */
+    int64_t packet_type;
+    int64_t serial; /* 0: not known */
+    int64_t frame_at;
+    int64_t frames; /* frame numbers wrap there */
+    int64_t rank_count;
+    const int64_t *rank; /* of the packets of a frame by block of columns, -1: not sent */
+    int64_t packets_per_frame;
+} StampedColumns;
+
+/* Velodyne: one timestamp, 4 bytes, us, and blocks with a flag and an azimuth of 2 bytes. A group of
+   blocks has one azimuth, and is one column or several. The speed of the rotor follows from the
+   steps between groups; a step that is wider than others spans a blind sector, whose duration
+   follows from the speed. */
+typedef struct {
+    int64_t packet_bytes;
+    int64_t columns;
+    int64_t groups;
+    int64_t blocks_per_group;
+    int64_t block_count;
+    int64_t block_bytes;
+    const int64_t *flags; /* (block_count,) in bytes 0 and 1 */
+    int64_t circle;       /* azimuths of a revolution */
+    int64_t widest;     /* step between groups that may be no gap; a resting rotor steps back less */
+    int64_t gap_factor; /* of the middle step, beyond which a wider one is a gap */
+    int64_t stamp_at;
+    int64_t period_ns;       /* of the timestamps */
+    int64_t clock_offset_ns; /* true time minus receive time */
+    int64_t mode_at;
+    const uint8_t *modes;    /* (256,) not 0: allowed values of the byte there; or NULL */
+    const int64_t *start_ns; /* (columns,) after the packet's timestamp */
+    const double *ahead_ns;  /* (columns,) after the azimuth of their group */
+    double group_ns;         /* from group to group */
+    double known_speed;      /* azimuths in a ns, of packets with one group */
+    double slowest;          /* below, a wide step is no blind sector */
+    double tolerance;        /* of the known speed, which is used across blind sectors */
+    int64_t follows_rotor;   /* rotor words have the speed */
+} PacedBlocks;
+
+/* HESAI: a date, and blocks with an azimuth each, one block per return. A column is a group of
+   blocks. Its time is that of the packet, plus `base_ns`, plus a step for each group, plus
+   `first_ns` of its firing table, whose number is (value of `loop_at` + column + 1) modulo 2, or
+   follows from operation and azimuth state. */
+typedef struct {
+    int64_t packet_bytes;
+    int64_t columns;
+    int64_t returns;
+    int64_t first_block;
+    int64_t block_bytes;
+    int64_t azimuth_at;    /* of the packet, in the first block */
+    int64_t azimuth_bytes; /* 2, or 3 with a fine byte */
+    int64_t circle;        /* azimuths of a revolution */
+    int64_t check_count;
+    const Check *checks;
+    int64_t has_flags; /* blocks begin with FF EE */
+    int64_t mode_at;
+    const uint8_t *modes; /* (256,) not 0: allowed values of the byte there; or NULL */
+    int64_t date_at;      /* 6 bytes */
+    int64_t us_at;        /* 4 bytes */
+    int64_t sequence_at;
+    int64_t sequence_bytes;
+    int64_t operation_at;
+    int64_t operations;
+    int64_t loop_at;
+    int64_t states_at;
+    int64_t state_count;
+    const int64_t *tables;   /* (operations, state_count) */
+    const int64_t *first_ns; /* of each table, of the earliest beam */
+    int64_t base_ns;
+    const int64_t *step_ns; /* (operations,) of `divisor` groups */
+    int64_t divisor;
+    int64_t counts_back; /* the last group has step 0, and those before it negative ones */
+    int64_t azimuth_ns;  /* when the rotor is at a block's azimuth, after the block's time */
+    int64_t rpm_at;
+    int64_t rpm_is_signed;
+    double turns_per_s; /* of one step of the speed field */
+} DatedGroups;
+
+/* ROBOSENSE: one time, 10 bytes, big-endian, seconds and microseconds or calendar, and rows of
+   blocks with an id and an azimuth each. The speed of the rotor follows from the steps between
+   rows; at most one of them spans a gap in the field of view. */
+typedef struct {
+    int64_t packet_bytes;
+    int64_t columns; /* of a row */
+    int64_t rows;
+    int64_t first_row;
+    int64_t row_bytes;
+    int64_t check_count;
+    const Check *checks;
+    int64_t foreign_count;
+    const Check *foreign; /* of device packets on the same topic */
+    int64_t point_at;     /* byte that is 0 in point packets */
+    int64_t row_id;
+    int64_t row_id_bytes;
+    int64_t circle; /* azimuths of a revolution */
+    int64_t widest; /* step between rows without a gap */
+    int64_t time_at;
+    int64_t is_calendar;
+    int64_t counter_at;      /* 4 bytes, big-endian */
+    int64_t repeats;         /* rows of equal azimuth have equal times */
+    int64_t row_ns;          /* from row to row */
+    const int64_t *start_ns; /* (columns,) after the begin of their row */
+    const double *start_s;   /* (columns,) the same */
+    double known_speed;      /* azimuths in a s; 0: unknown */
+    double turns;            /* revolutions of an azimuth; negative if the rotor is mirrored */
+    double following;        /* the same for the speed in rotor words, 0 to ignore it */
+} TimedRows;
+
+/* Livox, and clouds of one column each: columns that follow each other evenly. */
+typedef struct {
+    int64_t packet_bytes;
+    int64_t columns;
+    int64_t check_count;
+    const Check *checks;
+    int64_t stamp_at;    /* 8 bytes, ns */
+    int64_t interval_at; /* 2 bytes, of all columns */
+    int64_t interval_ns; /* a step of it */
+    int64_t counter_at;  /* 2 bytes */
+    int64_t ring_at;     /* 2 bytes, modulo `rings`: the firing table of the columns */
+    int64_t rings;
+} EvenColumns;
 
 /* How the headers of a sensor's packets are read: `lidar/headers.py`, HeaderReader. */
 typedef struct {

@@ -2,17 +2,13 @@
 
 from __future__ import annotations
 
-import ctypes
-import re
 import zlib
-from pathlib import Path
 
 import numpy as np
 import pytest
 
-from mlbatch import native
 from mlbatch.arrays import U8Array
-from mlbatch.lidar import headers
+from mlbatch.lidar.headers import EvenColumns
 from mlbatch.lidar.interface import Lidar
 from mlbatch.sensors.ouster.profiles import FUSA, PROFILES, STANDARD
 from mlbatch.simulate.ouster.encode import OusterSpec
@@ -114,14 +110,6 @@ def test_of_no_packets_there_are_no_headers() -> None:
     assert found.stamp_ns.shape == (0, 16)
 
 
-def test_tables_have_the_fields_of_the_structs() -> None:
-    source = (Path(native.__file__).parent / "headers.c").read_text(encoding="utf-8")
-    source = re.sub(r"/\*.*?\*/", "", source, flags=re.DOTALL)
-    words = {"int64_t": ctypes.c_int64, "double": ctypes.c_double}
-    for kind in headers._KINDS:
-        (body,) = re.findall(rf"typedef struct {{([^}}]*)}} {kind.__name__};", source)
-        members = re.findall(r"(\w+) (\*?)(\w+);", body)
-        expected = [
-            (name, ctypes.c_void_p if star else words[word]) for word, star, name in members
-        ]
-        assert headers.fields_of(kind) == expected
+def test_a_table_has_all_members_of_its_struct_and_no_others() -> None:
+    with pytest.raises(TypeError, match=r"EvenColumns: .*'checks'.*'no_member'"):
+        EvenColumns(packet_bytes=8, columns=1, no_member=1)

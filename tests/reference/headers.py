@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from datetime import datetime, timedelta, timezone
 from math import floor
 from statistics import median_low
+from typing import Any
 
 from mlbatch.lidar.headers import (
     DatedGroups,
@@ -24,6 +25,11 @@ from mlbatch.lidar.headers import (
 _EPOCH = datetime(1970, 1, 1, tzinfo=timezone.utc)
 _NS = 10**9
 GOOD, BAD_HEADER = 0, 2
+
+
+def _of(table: HeaderTable, name: str) -> Any:
+    """An array of a table, as the vendor gave it."""
+    return vars(table)["kept"].get(name)
 
 
 @dataclass
@@ -46,6 +52,7 @@ def read(table: HeaderTable, packet: bytes, host_ns: int) -> Seen:
         return _dated(table, packet)
     if isinstance(table, TimedRows):
         return _timed(table, packet)
+    assert isinstance(table, EvenColumns)
     return _even(table, packet)
 
 
@@ -84,7 +91,7 @@ def _stamped(table: StampedColumns, packet: bytes) -> Seen:
         if len({(one[3], one[1] // table.columns) for one in measured}) > 1:
             fault = BAD_HEADER
     else:
-        forms = table.forms.tolist()
+        forms = _of(table, "forms").tolist()
         serials = [_number(packet, *form[1]) for form in forms]
         chosen = 0
         if table.serial and serials[0] != table.serial and table.serial in serials:
@@ -95,7 +102,7 @@ def _stamped(table: StampedColumns, packet: bytes) -> Seen:
         frame = _number(packet, *forms[chosen][2])
     frame %= table.frames
     block = columns[0][1] // table.columns
-    rank = int(table.rank[block]) if block < table.rank_count else -1
+    rank = int(_of(table, "rank")[block]) if block < table.rank_count else -1
     key = frame * table.packets_per_frame + rank
     if rank < 0:
         key = -1 - (frame * table.rank_count + block)
@@ -104,8 +111,8 @@ def _stamped(table: StampedColumns, packet: bytes) -> Seen:
 
 def _paced(table: PacedBlocks, packet: bytes, host_ns: int) -> Seen:
     blocks = [packet[at * table.block_bytes :][:4] for at in range(table.block_count)]
-    good = table.modes is None or bool(table.modes[packet[table.mode_at]])
-    for block, flag in zip(blocks, table.flags.tolist(), strict=True):
+    good = _of(table, "modes") is None or bool(_of(table, "modes")[packet[table.mode_at]])
+    for block, flag in zip(blocks, _of(table, "flags").tolist(), strict=True):
         good &= _number(block, 0, 2) == flag and _number(block, 2, 2) <= table.circle
     firsts = [group * table.blocks_per_group * table.block_bytes for group in range(table.groups)]
     azimuth = [_number(packet, at + 2, 2) for at in firsts]
@@ -138,8 +145,8 @@ def _paced(table: PacedBlocks, packet: bytes, host_ns: int) -> Seen:
     columns = []
     for column in range(table.columns):
         group = column * table.groups // table.columns
-        turns = (azimuth[group] + speed * float(table.ahead_ns[column])) / table.circle
-        stamp_ns = packet_ns + delay_ns[group] + int(table.start_ns[column])
+        turns = (azimuth[group] + speed * float(_of(table, "ahead_ns")[column])) / table.circle
+        stamp_ns = packet_ns + delay_ns[group] + int(_of(table, "start_ns")[column])
         columns.append((stamp_ns, rotor_word(turns, per_s, 0), True))
     return Seen(True, GOOD if good else BAD_HEADER, None, columns)
 
@@ -171,8 +178,8 @@ def _dated(table: DatedGroups, packet: bytes) -> Seen:
         if size == 3:
             ticks = ticks * 256 + packet[table.azimuth_at + at + 2]
         blocks.append((packet[table.first_block + at :][:2], ticks))
-    good = _has(packet, table.checks.tolist())
-    good &= table.modes is None or bool(table.modes[packet[table.mode_at]])
+    good = _has(packet, _of(table, "checks").tolist())
+    good &= _of(table, "modes") is None or bool(_of(table, "modes")[packet[table.mode_at]])
     good &= not table.has_flags or all(flag == b"\xff\xee" for flag, _ in blocks)
     packet_ns = _dated_ns(table, packet)
     good &= packet_ns is not None
@@ -193,10 +200,10 @@ def _dated(table: DatedGroups, packet: bytes) -> Seen:
         elif table.states_at >= 0:
             states = _number(packet, table.states_at, 2)
             state = states >> (14 - 2 * table.returns * column) & 3
-            row = int(table.tables[operation, state])
-        first_ns = int(table.first_ns[row])
+            row = int(_of(table, "tables")[operation, state])
+        first_ns = int(_of(table, "first_ns")[row])
         number = column - (table.columns - 1) * table.counts_back
-        offset_ns = table.base_ns + int(table.step_ns[operation]) * number // table.divisor
+        offset_ns = table.base_ns + int(_of(table, "step_ns")[operation]) * number // table.divisor
         turns = azimuth / table.circle + speed * ((first_ns - table.azimuth_ns) * 1e-9)
         stamp_ns = (packet_ns or 0) + offset_ns + first_ns
         columns.append((stamp_ns, rotor_word(turns, speed, row), True))
@@ -223,11 +230,11 @@ def _timed_ns(table: TimedRows, packet: bytes) -> int | None:
 
 
 def _timed(table: TimedRows, packet: bytes) -> Seen:
-    is_mine = not _has(packet, table.foreign.tolist())
+    is_mine = not _has(packet, _of(table, "foreign").tolist())
     if table.point_at >= 0:
         is_mine &= packet[table.point_at] == 0
     packet_ns = _timed_ns(table, packet)
-    good = _has(packet, table.checks.tolist()) and packet_ns is not None
+    good = _has(packet, _of(table, "checks").tolist()) and packet_ns is not None
     rows = []
     for row in range(table.rows):
         own = packet[table.first_row + row * table.row_bytes :][:4]
@@ -255,7 +262,7 @@ def _timed(table: TimedRows, packet: bytes) -> Seen:
     columns = []
     for row, (azimuth, valid) in enumerate(rows):
         begin_ns = (packet_ns or 0) + sum(waits_ns[: row + 1])
-        for start_ns in table.start_ns.tolist():
+        for start_ns in _of(table, "start_ns").tolist():
             turns = table.turns * (azimuth + speed * (start_ns / _NS))
             word = rotor_word(turns, table.following * speed, 0)
             columns.append((begin_ns + start_ns, word, valid))
@@ -275,6 +282,6 @@ def _even(table: EvenColumns, packet: bytes) -> Seen:
         (first_ns + interval_ns * number // table.columns, ring * 2**56, True)
         for number in range(table.columns)
     ]
-    good = _has(packet, table.checks.tolist())
+    good = _has(packet, _of(table, "checks").tolist())
     key = None if table.counter_at < 0 else _number(packet, table.counter_at, 2)
     return Seen(True, GOOD if good else BAD_HEADER, key, columns)
