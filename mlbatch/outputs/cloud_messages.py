@@ -102,34 +102,34 @@ class Cloud:
 def read_cloud(cursor: MessageCursor) -> Cloud:
     """One message; DamageError if it is damaged or of no preset."""
     stamp_ns, frame_id = cursor.header()
-    height = cursor.integer("I")
-    width = cursor.integer("I")
+    height = cursor.number("I")
+    width = cursor.number("I")
     fields = []
-    for _ in range(cursor.integer("I")):
+    for _ in range(cursor.number("I")):
         name = cursor.text()
-        offset = cursor.integer("I")
-        code = cursor.integer("B")
-        count = cursor.integer("I")
+        offset = cursor.number("I")
+        code = cursor.number("B")
+        count = cursor.number("I")
         if count != 1:
             raise DamageError("fields of one value", f"{name} of {count}")
         fields.append((name, offset, code))
-    big_endian = cursor.integer("B")
-    step = cursor.integer("I")
-    row = cursor.integer("I")
+    big_endian = cursor.number("B")
+    step = cursor.number("I")
+    row = cursor.number("I")
     layouts = [
         name for name, one in PRESETS.items() if (one.step, one.fields) == (step, tuple(fields))
     ]
     if not layouts or big_endian:
         found = ", ".join(f"{name}@{offset} type {code}" for name, offset, code in fields)
         raise DamageError("little-endian fields of a point layout", f"{found}; step {step}")
-    data = cursor.bytes_of(cursor.integer("I"))
+    data = cursor.bytes_of(cursor.number("I"))
     if row != step * width or len(data) != row * height:
         raise DamageError(
             f"{height} rows of {width} points of {step} bytes",
             f"rows of {row} bytes, {len(data)} in all",
         )
-    is_dense = bool(cursor.integer("B"))
-    cursor.end("a PointCloud2")
+    is_dense = bool(cursor.number("B"))
+    cursor.finish("a PointCloud2")
     records = np.frombuffer(data, PRESETS[layouts[0]].dtype).reshape(height, width)
     return Cloud(stamp_ns, frame_id, layouts[0], records, is_dense)
 

@@ -228,7 +228,7 @@ class TopicChecks:
         self._named.setdefault(message.topic, set()).add(frame)
         log.equal("imu", f"{where} publish time", stamp_ns, message.publish_ns)
         values = cursor.floats(_IMU_FLOATS)
-        cursor.end("an Imu message")
+        cursor.finish("an Imu message")
         if not np.isfinite(values).all():
             log.fail("imu", where, "finite numbers", values)
         if not 0 <= stamp_ns < _STAMP_LIMIT_NS:
@@ -247,7 +247,7 @@ class TopicChecks:
             return
         cursor = MessageCursor.of_message(message.data, message.encoding)
         transforms = []
-        for _ in range(cursor.integer("I")):
+        for _ in range(cursor.number("I")):
             stamp_ns, parent = cursor.header()
             log.equal("tf_static", f"{where} stamp", message.log_ns, stamp_ns)
             child = cursor.text()
@@ -256,7 +256,7 @@ class TopicChecks:
             if not abs(float(rotation @ rotation) - 1) < _LARGEST_ERROR:
                 log.fail("tf_static", f"{where} {child}", "a unit quaternion", rotation)
             transforms.append(Transform(parent, child, translation_m, rotation))
-        cursor.end("a TFMessage")
+        cursor.finish("a TFMessage")
         roots = self._check_tree(where, transforms)
         self._check_sensors(where, transforms, roots)
 
@@ -311,7 +311,7 @@ class TopicChecks:
     def _add_moving_frames(self, message: Message) -> None:
         """Add the frames of a recorded /tf."""
         cursor = MessageCursor.of_message(message.data, message.encoding)
-        for _ in range(cursor.integer("I")):
+        for _ in range(cursor.number("I")):
             _, parent = cursor.header()
             self.tree |= {_clean(parent), _clean(cursor.text())}
             cursor.floats(7)
