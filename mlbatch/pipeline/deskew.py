@@ -189,11 +189,8 @@ class Deskew(Mover):
         self._check.add(window, line, self.source.name, is_last=self.source.is_complete)
         counts.moved += len(columns)
         moves = line.moves(columns.stamp_ns, to_ns)
-        pose = line.track.at(np.array([to_ns]))
-        world_from_body = np.eye(4)
-        world_from_body[:3, :3], world_from_body[:3, 3] = pose.rotation[0], pose.position_m[0]
         columns = replace(columns, moves=moves)
-        yield replace(window, columns=columns, world_from_body=world_from_body)
+        yield replace(window, columns=columns, world_from_body=line.track.at(to_ns))
 
 
 # -- by the points of windows ---------------------------------------------------------------------
