@@ -188,8 +188,9 @@ def test_no_mix_of_faults_of_one_lidar_is_two_lidars(unit: Unit) -> None:
     assert refused == []
 
 
-@pytest.mark.parametrize("loss", [0, 0.1, 0.3])
-@pytest.mark.parametrize("share", [0.07, 0.3, 0.5, 0.81])
+@pytest.mark.parametrize(
+    ("share", "loss"), [(0.07, 0), (0.3, 0.1), (0.5, 0.3), (0.81, 0.3), (0.5, 0)]
+)
 def test_two_lidars_of_any_phase_are_found(unit: Unit, share: float, loss: float) -> None:
     ahead_ns = 33 * NS_PER_MS // unit.step_ns * unit.step_ns + int(share * unit.step_ns)
     assert "several lidars share the address" in unit.problem(two(unit, ahead_ns, loss=loss))
@@ -204,8 +205,7 @@ def test_a_lidar_that_starts_later_is_found(unit: Unit) -> None:
     assert unit.problem(two(unit, 33 * NS_PER_MS + unit.step_ns // 3, from_ns=3 * NS_PER_S))
 
 
-@pytest.mark.parametrize("clock_s", [1.5, 3, 700, -700])
-@pytest.mark.parametrize("loss", [0, 0.1])
+@pytest.mark.parametrize(("clock_s", "loss"), [(1.5, 0.1), (3, 0), (700, 0.1), (-700, 0)])
 def test_two_clocks_are_found(unit: Unit, clock_s: float, loss: float) -> None:
     sent = two(unit, 5 * NS_PER_MS, round(clock_s * NS_PER_S), loss=loss)
     assert "several lidars share the address" in unit.problem(sent)

@@ -93,9 +93,8 @@ OPTIONS: dict[str, dict[str, Any]] = {
     "slices": {"split": True, "slices": 4},
 }
 ORGANIZED = [*FORMATS[:5], ("pcd", "pcd")]
-CASES = [
-    (word, *one) for word in OPTIONS for one in (ORGANIZED if word == "organized" else FORMATS)
-]
+OF_WORDS = {"15 Hz": FORMATS[::2], "10/3 Hz": FORMATS[1::2], "organized": ORGANIZED}
+CASES = [(word, *one) for word in OPTIONS for one in OF_WORDS.get(word, FORMATS)]
 
 
 @pytest.mark.parametrize(("word", "name", "kind"), CASES)
