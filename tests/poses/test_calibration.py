@@ -43,7 +43,6 @@ _NO_AXES = np.zeros((6, 0))
 GUESSES = {
     "20 degrees about z, 1 m": ([0.8, 0.6, 0.0], [0.0, 0.0, 20.0]),
     "12 degrees about x, 0.6 m": ([0.0, -0.36, 0.48], [12.0, 0.0, 0.0]),
-    "true": ([0.0, 0.0, 0.0], [0.0, 0.0, 0.0]),
 }
 
 
@@ -110,7 +109,7 @@ def test_a_guess_becomes_the_true_pose(
     assert pair.after.share > 0.95
     # As with the true poses.
     assert pair.after.apart_mm == pytest.approx(calibration.pairs[0].before.apart_mm, rel=0.05)
-    assert pair.before.share < 0.7 or name == "true"
+    assert pair.before.share < 0.7
 
 
 def _scene(boxes: str) -> str:
@@ -246,9 +245,9 @@ def test_motion_needs_no_guess(tmp_path: Path) -> None:
 def test_a_clock_that_is_a_third_of_a_second_ahead(tmp_path: Path) -> None:
     """Far more than surfaces alone find; the turns of both lidars say it."""
     head, sway = MOTION.split("  sway:")
-    more = "    - [5, -0.8, 0.2, 1.2, 320]\n    - [8, 0.6, -0.3, 1.2, 520]\n"
+    more = "    - [5, -0.8, 0.2, 1.2, 320]\n"
     sensors = SENSORS.replace("{name: right", "{name: right, clock: {offset_s: 0.3}")
-    text = scenario_text(sensors, motion=f"{head}{more}  sway:{sway}", duration=7)
+    text = scenario_text(sensors, motion=f"{head}{more}  sway:{sway}", duration=4.5)
     drive = record(tmp_path, text)
     guess = guessed(drive.rig, tmp_path / "guess.yaml", [0.1, 0.1, -0.05], [2, 1, 5])
     _, right = mlbatch.calibrate(drive.path, guess, time_offset=True).lidars
