@@ -85,6 +85,8 @@ def test_points_of_a_page_are_those_of_the_scan(case: str, shell: Shell) -> None
     assert shell(f"convert {FIX} -o shown {FORMATS[case]} --quiet").code == 0
     outcome = shell("report shown -o page.html")
     assert (outcome.code, outcome.err, outcome.out) == (0, "", "wrote page.html\n")
+    page = Path("page.html").read_text(encoding="utf-8")
+    assert "Packets, windows and clocks are fine; surfaces agree within " in page
     clouds = plot_data(Path("page.html"))["clouds"]
     # All 7, since they are small.
     assert [cloud["title"] for cloud in clouds] == [f"Scan {k}, +0.{k} s" for k in range(7)]
