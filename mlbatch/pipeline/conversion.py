@@ -46,7 +46,7 @@ from mlbatch.units import NS_PER_MS, NS_PER_S, rate_text
 if TYPE_CHECKING:
     from mlbatch.batching.fusion import SweepFusion
     from mlbatch.batching.sweeps import SweepCutter
-    from mlbatch.pipeline.deskew import Mover
+    from mlbatch.pipeline.deskew import ConstantVelocity, Deskew
     from mlbatch.pipeline.pose_check import PoseCheck
 
 # Called with the bytes read so far, the bytes of all recordings, and the scans so far.
@@ -166,14 +166,15 @@ class Conversion:
         self.dropped_incomplete = 0
         self.notes_before_points = 0
         self._plain_decoder: Decoder | None = None
-        self.deskew: Mover | None = None
+        self.deskew: Deskew | ConstantVelocity | None = None
         self.imu_users: list[ImuUser] = []
         if job.deskew:
             from mlbatch.pipeline.deskew import mover_of
 
             self.deskew = mover_of(self)
             self.users.append(self.deskew.oldest_ring_index)
-            self.imu_users.append(self.deskew.add)
+            if self.deskew.source is not None:
+                self.imu_users.append(self.deskew.source.add)
         self.poses = PoseFigures(ONE_LIDAR if job.checks_poses else NOT_ASKED)
         self.pose_check = self._new_pose_check()
         self._buffers = buffers
@@ -510,8 +511,10 @@ class Conversion:
         points: Iterable[Note] = ()
         if self.job.shard is None:
             where = ", ".join(map(str, self.job.recordings))
-            run_report.refuse_all_removed(where, [sensor.ledger.points for sensor in self.sensors])
-            points = run_report.notes_of_run(self)
+            counts = [(sensor.name, sensor.ledger.points) for sensor in self.sensors]
+            run_report.refuse_all_removed(where, [one for _, one in counts])
+            if self.table is not None:
+                points = run_report.point_notes(counts, self.table.statistics(0))
         for note in (*points, *run_report.unassigned_notes(self), *run_report.clock_notes(self)):
             self.warn(note)
         # A later message may be the first without receive times.

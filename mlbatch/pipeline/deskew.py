@@ -7,7 +7,7 @@ result depends on no worker, and shards and resumed runs, which batch everything
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
@@ -24,7 +24,7 @@ from mlbatch.pipeline.decode_pool import first_ring_index
 from mlbatch.pipeline.imu_poses import IMU, ImuPoses, PoseSource
 from mlbatch.pipeline.rotation_check import RotationCheck
 from mlbatch.reports.motion import MotionLedger, VelocityCounts
-from mlbatch.types import ImuSamples, Message, Scan, Window, WindowColumns, instant_ns
+from mlbatch.types import Scan, Window, WindowColumns, instant_ns
 from mlbatch.units import NS_PER_S
 
 if TYPE_CHECKING:
@@ -37,7 +37,7 @@ _SLOTS = 1 << 16
 _LEAST_WAIT_NS = 2 * NS_PER_S
 
 
-def mover_of(run: Conversion) -> Mover:
+def mover_of(run: Conversion) -> Deskew | ConstantVelocity:
     """The object that moves columns for `--deskew`."""
     job = run.job
     points = WindowPoints(run.grid, [sensor.source.slots for sensor in run.sensors], run.plain_scan)
@@ -52,54 +52,15 @@ def mover_of(run: Conversion) -> Mover:
     return Deskew(source, job.deskew_to, job.max_wait_ns, points, len(run.sensors))
 
 
-class Mover:
-    """Takes windows or their slices, yields them with the transforms of their columns.
-
-    dropped: columns of each sensor in windows that were left out.
-    """
-
-    def __init__(self, counts: MotionLedger, sensors: int) -> None:
-        self._counts = counts
-        self.dropped = [0] * sensors
-
-    @property
-    def ledger(self) -> MotionLedger:
-        """Counts so far."""
-        return self._counts
-
-    @property
-    def integrated_s(self) -> float:
-        """How long velocities of an IMU were integrated, s."""
-        return 0.0
-
-    def add(self, imu: Iterable[ImuSamples], messages: Iterable[Message]) -> None:
-        """Add what a batch of the recording contains."""
-
-    def push(self, window: Window) -> Iterator[Window]:
-        """Add the next window; yield windows whose moves are known."""
-        raise NotImplementedError
-
-    def finish(self) -> Iterator[Window]:
-        """Yield the windows that wait, at the end of input."""
-        raise NotImplementedError
-
-    def awaits(self, newest_ns: int) -> bool:
-        """Whether windows wait for poses that may come; newest_ns: newest stamp of all sensors."""
-        return False
-
-    def oldest_ring_index(self, sensor: int) -> int | None:
-        """First ring index of a sensor in the windows that wait; None: none."""
-        raise NotImplementedError
-
-
 # -- by poses -------------------------------------------------------------------------------------
 
 
-class Deskew(Mover):
-    """By poses; a window waits until they reach its end, at most `--max-wait`, or 2 s.
+class Deskew:
+    """Takes windows, yields them with the transforms of their columns, by poses.
 
-    It is moved as a whole: if there is no pose at one of its columns, or at its instant, it is left
-    out and its columns are counted as `no_pose`.
+    A window waits until they reach its end, at most `--max-wait`, or 2 s. It is moved as a whole:
+    if there is no pose at one of its columns, or at its instant, it is left out and its columns are
+    counted as `no_pose`, and in `dropped` by sensor.
     """
 
     def __init__(
@@ -114,20 +75,12 @@ class Deskew(Mover):
 
         points: what reads the points of windows, for the check.
         """
-        super().__init__(MotionLedger(source.name, to), sensors)
+        self._counts = MotionLedger(source.name, to)
+        self.dropped = [0] * sensors
         self.source = source
         self._max_wait_ns = None if max_wait_ns is None else max(max_wait_ns, _LEAST_WAIT_NS)
         self._waiting: deque[Window] = deque()
         self._check = RotationCheck(points)
-
-    @property
-    def integrated_s(self) -> float:
-        """How long velocities of an IMU were integrated, s."""
-        return self.source.integrated_s
-
-    def add(self, imu: Iterable[ImuSamples], messages: Iterable[Message]) -> None:
-        """Add what a batch of the recording contains."""
-        self.source.add(imu, messages)
 
     def push(self, window: Window) -> Iterator[Window]:
         """Add the next window."""
@@ -266,12 +219,15 @@ class WindowPoints:
         return ColumnCloud(scan.xyz.astype(np.float64), scan.column.astype(np.int64), time_s)
 
 
-class ConstantVelocity(Mover):
-    """By the velocity that the points of each window give; unmoved where they give none."""
+class ConstantVelocity:
+    """As `Deskew`, by the velocity that the points give; windows without one are not moved."""
+
+    source: PoseSource | None = None
 
     def __init__(self, to: str, points: WindowPoints, sensors: int) -> None:
         """to: a word of INSTANTS; points: what reads the points of windows."""
-        super().__init__(MotionLedger(CONSTANT_VELOCITY, to, velocity=VelocityCounts()), sensors)
+        self.ledger = MotionLedger(CONSTANT_VELOCITY, to, velocity=VelocityCounts())
+        self.dropped = [0] * sensors
         self._points = points
         self._estimator = VelocityEstimator()
 
@@ -289,6 +245,10 @@ class ConstantVelocity(Mover):
         """First ring index of a sensor in the slices that wait; None: none."""
         return self._points.oldest_ring_index(sensor)
 
+    def awaits(self, newest_ns: int) -> bool:
+        """False: a window needs nothing that is recorded after it."""
+        return False
+
     def _moved(self, whole: WindowCloud) -> Iterator[Window]:
         cloud, start_ns, end_ns, slices = whole
         middle_ns = (start_ns + end_ns) // 2
@@ -300,12 +260,12 @@ class ConstantVelocity(Mover):
         line = _line(estimate.velocity, start_ns, end_ns)
         for window in slices:
             columns = window.columns
-            to_ns = instant_ns(self._counts.to, window.start_ns, window.end_ns)
+            to_ns = instant_ns(self.ledger.to, window.start_ns, window.end_ns)
             moves = line.moves(columns.stamp_ns, to_ns)
             yield replace(window, columns=replace(columns, moves=moves))
 
     def _count(self, estimate: Estimate, slices: list[Window]) -> None:
-        counts = self._counts
+        counts = self.ledger
         columns = sum(len(window.columns) for window in slices)
         counts.columns += columns
         velocity = counts.velocity

@@ -84,8 +84,12 @@ def check_disk(job: Job, output: Path) -> str:
     recorded = sum(path.stat().st_size for path in job.recordings if path.is_file())
     if job.shard is not None:
         recorded //= job.shard.count
+    if free_bytes(output) >= recorded:
+        return ""
     # As a rule there is space for all, and the rig need not be read here.
-    if free_bytes(output) >= recorded or _is_limited_by_rig(job):
+    rig = job.selection.rig
+    sensors = () if rig is None else read_rig(rig, job.recordings).sensors
+    if any((sensor.max_range_m or math.inf) < math.inf for sensor in sensors):
         return ""
     check_free_space(output, recorded // LEAST_OUTPUT)
     return (
@@ -99,13 +103,6 @@ def _is_limited(job: Job) -> bool:
     selection = job.selection
     in_time = job.start is not None or job.end is not None
     return in_time or job.max_range_m < math.inf or bool(selection.only or selection.ignore)
-
-
-def _is_limited_by_rig(job: Job) -> bool:
-    """True if the rig can make it arbitrarily small."""
-    path = job.selection.rig
-    sensors = () if path is None else read_rig(path, job.recordings).sensors
-    return any((sensor.max_range_m or math.inf) < math.inf for sensor in sensors)
 
 
 def check_report(job: Job, path: Path | None, output: Path | None, name: str) -> None:

@@ -7,7 +7,6 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from mlbatch.arrays import U8Array
 from mlbatch.clocks.compare import SYNCHRONISED, compare
 from mlbatch.clocks.host_offset import HostOffset, describe_off
 from mlbatch.clocks.timescale import describe_time
@@ -46,7 +45,14 @@ _NO_SCANS = ScanStatistics(0, 0, 0, 0, 0, {}, {}, {}, 0, 0, Spread(), Spread())
 
 def run_report(run: Conversion) -> RunReport:
     """Collect the content of report.json."""
-    table = run.table
+    table, replay = run.table, run.session.replay
+    first_scan = ""
+    if table is not None and table.first_start_ns is not None and run.info is not None:
+        first_scan = describe_time(table.first_start_ns, run.info.timescale)
+    repeated = 0
+    # With an end, only datagrams after fault injection are counted.
+    if replay is not None and not run.batcher.past_end:
+        repeated = sum(one.repeated - one.removed for one in replay.ledgers)
     return RunReport(
         inputs=tuple(
             InputReport(str(r.path), r.size_bytes, r.container) for r in run.session.recordings
@@ -77,10 +83,10 @@ def run_report(run: Conversion) -> RunReport:
             for topic, counts in sorted(run.messages.counts.items())
         ),
         faults=()
-        if run.session.replay is None
-        else tuple(FaultReport(one.fault, one.packets) for one in run.session.replay.counts),
-        repeated=_repeated(run),
-        first_scan=_first_scan(run),
+        if replay is None
+        else tuple(FaultReport(one.fault, one.packets) for one in replay.counts),
+        repeated=repeated,
+        first_scan=first_scan,
         warnings=tuple(Warned(n.code, n.sensor, n.message) for n in run.notes),
     )
 
@@ -254,7 +260,7 @@ def _motion_notes(run: Conversion) -> Iterator[Note]:
             f"(windows: {velocity.describe()}); look at scene and motion, or give a trajectory "
             "(--deskew FILE.tum)",
         )
-    seconds = run.deskew.integrated_s
+    seconds = 0.0 if run.deskew.source is None else run.deskew.source.integrated_s
     if seconds > DRIFT_S:
         yield Note(
             "deskew_drift",
@@ -293,12 +299,6 @@ def _loss_notes(run: Conversion) -> Iterator[Note]:
             yield Note("loss", sensor.name, f"{sensor.name}: {'; '.join(texts)}")
 
 
-def notes_of_run(run: Conversion) -> Iterator[Note]:
-    """Warnings about the points of a run."""
-    points = [(sensor.name, sensor.ledger.points) for sensor in run.sensors]
-    return point_notes(points, _NO_SCANS if run.table is None else run.table.statistics(0))
-
-
 def unassigned_notes(run: Conversion) -> Iterator[Note]:
     """Warnings about lidar packets of no sensor, unless the user left them out.
 
@@ -335,19 +335,17 @@ def unassigned_notes(run: Conversion) -> Iterator[Note]:
             )
 
 
-def message_notes(run: Conversion) -> list[Note]:
+def message_notes(run: Conversion) -> Iterator[Note]:
     """Warnings about messages that could not be forwarded."""
-    notes = []
     for topic, counts in run.messages.counts.items():
         if run.messages.has_place and (other := counts.dropped.get("no_place")):
             text = f"{topic}: {other} message(s) dropped: the output cannot store its ROS version"
-            notes.append(Note("other_ros", "", text))
+            yield Note("other_ros", "", text)
         if other := counts.dropped.get("other_clock"):
             text = (
                 f"{topic}: {other} message(s) dropped: their clock differs from that of the scans"
             )
-            notes.append(Note("imu_clock", "", text))
-    return notes
+            yield Note("imu_clock", "", text)
 
 
 def why_no_scan(run: Conversion) -> str:
@@ -404,12 +402,6 @@ def why_no_scan(run: Conversion) -> str:
     )
 
 
-def _first_scan(run: Conversion) -> str:
-    if run.table is None or run.table.first_start_ns is None or run.info is None:
-        return ""
-    return describe_time(run.table.first_start_ns, run.info.timescale)
-
-
 def _capture(run: Conversion) -> CaptureCounts:
     total = CaptureCounts()
     for recording in run.session.recordings:
@@ -423,14 +415,6 @@ def _capture(run: Conversion) -> CaptureCounts:
         total.frames -= ahead
         total.datagrams -= ahead
     return total
-
-
-def _repeated(run: Conversion) -> int:
-    """Datagrams that injected faults duplicated, minus datagrams that they removed."""
-    if run.session.replay is None or run.batcher.past_end:
-        # With an end, only datagrams after fault injection are counted.
-        return 0
-    return sum(one.repeated - one.removed for one in run.session.replay.ledgers)
 
 
 def _sensor(run: Conversion, sensor: Sensor) -> SensorReport:
@@ -507,16 +491,12 @@ def _what(run: Conversion, kind: PacketKind, ignored: bool) -> str:
     """Description of unassigned packets: by some of them, else by those sampled by discovery."""
     packets = run.session.ingest.unassigned[kind, ignored]
     if packets.what is None:
-        packets.what = _described(run, kind, packets.sample)
+        sampler = run.session.setup.sampler
+        text = describe_each(kind.size, packets.sample)
+        if text is None and kind in sampler.kinds:
+            text = describe(sampler, kind)
+        packets.what = text or "unknown"
     return packets.what
-
-
-def _described(run: Conversion, kind: PacketKind, sample: U8Array) -> str:
-    sampler = run.session.setup.sampler
-    text = describe_each(kind.size, sample)
-    if text is None and kind in sampler.kinds:
-        text = describe(sampler, kind)
-    return text or "unknown"
 
 
 # -- points, of a run or of merged shards ----------------------------------------------------------

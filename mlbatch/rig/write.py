@@ -10,7 +10,7 @@ from pathlib import Path
 from mlbatch.arrays import F64Array
 from mlbatch.frames.transforms import from_rpy_deg, rpy_deg
 from mlbatch.rig.convert_keys import POSE_MODELS, RigOption
-from mlbatch.rig.rig import Rig, RigSensor, StreamSelector, UnknownExtrinsics
+from mlbatch.rig.rig import STREAM_FIELDS, Rig, RigSensor, StreamSelector, UnknownExtrinsics
 from mlbatch.units import NS_PER_S, rate_text
 
 # Text that needs no quotes, for any reader of YAML.
@@ -101,16 +101,11 @@ def _fields_text(pairs: Sequence[tuple[str, str]]) -> str:
 
 
 def _stream_text(stream: StreamSelector) -> str:
-    return _braces(
-        {
-            "source_ip": stream.source_ip and _text(stream.source_ip),
-            "port": str(stream.port or ""),
-            "topic": stream.topic and _text(stream.topic),
-            "serial": stream.serial and _text(stream.serial),
-            "frame_id": stream.frame_id and _text(stream.frame_id),
-            "lidar_id": "" if stream.lidar_id is None else str(stream.lidar_id),
-        }
-    )
+    words = {name: getattr(stream, name) for name in ("source_ip", "topic", "serial", "frame_id")}
+    numbers = {"port": stream.port or None, "lidar_id": stream.lidar_id}
+    texts = {name: _text(word) for name, word in words.items() if word}
+    texts |= {name: str(number) for name, number in numbers.items() if number is not None}
+    return _braces({name: texts[name] for name in STREAM_FIELDS if name in texts})
 
 
 def _extrinsics_lines(extrinsics: F64Array | str | UnknownExtrinsics | None) -> Iterator[str]:
