@@ -221,9 +221,11 @@ def _inputs(match: str, rig_of: Callable[[], str | None]) -> tuple[str, ...]:
     if is_url(match):
         if not match.endswith("/"):
             return (match,)
-        from mlbatch.batch.remote import inside
+        from mlbatch.batch.remote import listed
 
-        return tuple(one.url for one in inside(match) if _RECORDINGS.fullmatch(one.url))
+        return tuple(
+            one.url for one in listed(match, is_deep=False) if _RECORDINGS.fullmatch(one.url)
+        )
     path = Path(match)
     if not path.is_dir() or (path / BAG_METADATA).is_file():
         return (match,)

@@ -155,13 +155,17 @@ def _remote_file(root: str, meta: Any, url: str = "") -> RemoteFile:
     return RemoteFile(url or f"{root}/{meta['path']}", int(meta["size"]), version, changed_ns)
 
 
-def listed(url: str) -> list[RemoteFile]:
-    """All files below a folder, by name; none of a web server, which has no lists."""
+def listed(url: str, *, is_deep: bool = True) -> list[RemoteFile]:
+    """All files below a folder, or right in it, by name; none of a web server: it has no lists."""
     if url.partition("://")[0] in _WEB:
         return []
 
     def pages(obstore: Any, place: _Place) -> list[RemoteFile]:
-        batches = obstore.list(place.store, prefix=place.path.rstrip("/") or None)
+        prefix = place.path.rstrip("/") or None
+        if is_deep:
+            batches = obstore.list(place.store, prefix=prefix)
+        else:
+            batches = [obstore.list_with_delimiter(place.store, prefix=prefix)["objects"]]
         return [_remote_file(place.root, meta) for batch in batches for meta in batch]
 
     return sorted(_request(f"{url.rstrip('/')}/", pages))
@@ -207,7 +211,7 @@ def _named(folder: str, name: str) -> list[RemoteFile]:
             return [head(f"{folder}/{name}")]
         return []
     parent, _, pattern = f"{folder}/{name}".rpartition("/")
-    return [one for one in inside(parent) if fnmatch.fnmatchcase(one.name, pattern)]
+    return [one for one in listed(parent, is_deep=False) if fnmatch.fnmatchcase(one.name, pattern)]
 
 
 def calibrations(url: str) -> list[RemoteFile]:
@@ -216,24 +220,10 @@ def calibrations(url: str) -> list[RemoteFile]:
 
     return [
         one
-        for one in inside(url.rpartition("/")[0])
+        for one in listed(url.rpartition("/")[0], is_deep=False)
         if one.name.lower().endswith(CALIBRATION_SUFFIXES)
         and one.size <= MAX_CALIBRATION_FILE_BYTES
     ]
-
-
-def inside(folder: str) -> list[RemoteFile]:
-    """The files right in a folder."""
-    folder = folder.rstrip("/")
-    if folder.partition("://")[0] in _WEB:
-        return []
-
-    def objects(obstore: Any, place: _Place) -> list[RemoteFile]:
-        prefix = place.path.rstrip("/") or None
-        found = obstore.list_with_delimiter(place.store, prefix=prefix)
-        return [_remote_file(place.root, meta) for meta in found["objects"]]
-
-    return sorted(_request(f"{folder}/", objects))
 
 
 def matching(pattern: str) -> list[str]:

@@ -6,7 +6,7 @@ typer's own drawing loads a Markdown parser, which takes longer than all else in
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 from mlbatch import options
@@ -119,7 +119,8 @@ def drawn(command: Any, context: Any, groups: Mapping[str, Rows]) -> str:
     for title, rows in groups.items():
         table = _table(rows, names_width)
         console.print(Panel(table, title=title, title_align="left", border_style="dim"))
-    return "\n".join(_without_padding(text.getvalue()))
+    # Without padding.
+    return "\n".join(map(str.rstrip, text.getvalue().splitlines()))
 
 
 def _table(rows: Rows, names_width: int) -> Table:
@@ -136,8 +137,3 @@ def _table(rows: Rows, names_width: int) -> Table:
             help_text.append(f" [{extra}", style="dim")
         table.add_row(Text(name, style="cyan"), help_text)
     return table
-
-
-def _without_padding(text: str) -> Iterator[str]:
-    for line in text.splitlines():
-        yield line.rstrip()

@@ -260,7 +260,9 @@ def _pair(one: Named, two: Named, bound_ns: int) -> Pair:
         why = "they run apart" if apart_ppm else "their difference changes"
         why += f" by {format_difference(high_ns - low_ns)}"
         return pair._replace(whole=whole, why=why)
-    epoch = _epoch(estimate.domain, other.domain) if whole else ""
+    # Of the second clock in a rig, if the first is on UTC.
+    is_epoch = whole and estimate.domain == UTC and other.domain in (TAI, GPS)
+    epoch = other.domain if is_epoch else ""
     why = whole or "a constant offset"
     if apart_ppm:
         why += f", running apart by {apart_ppm:.2f} ppm"
@@ -270,11 +272,6 @@ def _pair(one: Named, two: Named, bound_ns: int) -> Pair:
         correction=Correction(other_name, name, -offset_ns, epoch, left_ns),
         why=why,
     )
-
-
-def _epoch(one: str, two: str) -> str:
-    """`clock.epoch` for the second clock in a rig, if the first is on UTC."""
-    return two if one == UTC and two in (TAI, GPS) else ""
 
 
 def _apart_ppm(one: ClockEstimate, two: ClockEstimate) -> float:

@@ -80,7 +80,12 @@ def best_fits(
     for group in groups.values():
         if model is not None:
             # A file of the unit is preferred to the built-in calibration of its model.
-            group = [one for one in group if _may_be(calibrations[one.number], model)] or group
+            may_be = [
+                one
+                for one in group
+                if calibrations[one.number].model == model or not calibrations[one.number].is_shared
+            ]
+            group = may_be or group
         score = max(one.score for one in group)
         best = [one for one in group if one.score == score]
         _refuse_ambiguous(evidence, [calibrations[one.number] for one in best])
@@ -94,10 +99,6 @@ def best_fits(
                 what = sensors.describe(evidence.size, evidence.sample) or "others"
                 failure = f"its packets are {what}, not {model}, as which they were read: {err}"
     return fits, failure
-
-
-def _may_be(calibration: Calibration, model: str) -> bool:
-    return calibration.model == model or not calibration.is_shared
 
 
 def _parts(

@@ -70,8 +70,10 @@ def job_identity(job: Job, name: str, options: WriterOptions) -> dict[str, str]:
     found["compression"] = options.compression
     if name == "ply":
         found["ply style"] = options.ply_style
-    for key, value in _options(job):
-        found[key.replace("_", " ")] = _text(value)
+    for holder in (job, job.selection):
+        for one in fields(holder):
+            if one.name not in _NOT_IDENTITY:
+                found[one.name.replace("_", " ")] = _text(getattr(holder, one.name))
     return found
 
 
@@ -143,13 +145,6 @@ def difference(old: Mapping[str, str], new: Mapping[str, str]) -> str:
         if before != now:
             return f"{key} {now or 'not given'!r} instead of {before or 'not given'!r}"
     return ""
-
-
-def _options(job: Job) -> Iterator[tuple[str, object]]:
-    for holder in (job, job.selection):
-        for one in fields(holder):
-            if one.name not in _NOT_IDENTITY:
-                yield one.name, getattr(holder, one.name)
 
 
 def _text(value: object) -> str:

@@ -150,21 +150,17 @@ class ImuQueue:
 
     def _sort(self, sensor: int) -> None:
         """Sort what waits by timestamp: packets may be reordered."""
-        samples = _joined([self._sorted[sensor], *self._new[sensor]])
+        parts = [self._sorted[sensor], *self._new[sensor]]
+        samples = ImuSamples(
+            sensor,
+            np.concatenate([part.stamp_ns for part in parts]),
+            np.concatenate([part.acceleration for part in parts]),
+            np.concatenate([part.angular_velocity for part in parts]),
+        )
         if not bool((np.diff(samples.stamp_ns) >= 0).all()):
             samples = _part(samples, np.argsort(samples.stamp_ns, kind="stable"))
         self._sorted[sensor] = samples
         self._new[sensor] = []
-
-
-def _joined(parts: Sequence[ImuSamples]) -> ImuSamples:
-    """Samples of one sensor as one."""
-    return ImuSamples(
-        parts[0].sensor,
-        np.concatenate([part.stamp_ns for part in parts]),
-        np.concatenate([part.acceleration for part in parts]),
-        np.concatenate([part.angular_velocity for part in parts]),
-    )
 
 
 def _part(samples: ImuSamples, which: BoolArray | I64Array | slice) -> ImuSamples:

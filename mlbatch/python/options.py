@@ -270,10 +270,6 @@ def _names_of(tables: Iterable[type]) -> list[str]:
     return [name for table in tables for name in table.__annotations__]
 
 
-def _as_in_python(name: str) -> str:
-    return name
-
-
 def complete(options: Mapping[str, Any], shown: Callable[[str], str]) -> dict[str, Any]:
     """All options of the table with the values given, else their defaults.
 
@@ -305,7 +301,7 @@ def _check_number(option: Option, value: Any, shown: str) -> None:
 def session_job(
     recordings: Paths | tuple[Paths, ...],
     options: SessionOptions,
-    shown: Callable[[str], str] = _as_in_python,
+    shown: Callable[[str], str] = str,
 ) -> Job:
     """The options that select recordings and sensors; those of windows have their defaults.
 
@@ -336,7 +332,7 @@ def session_job(
     )
 
 
-def window_job(job: Job, options: RatedOptions, shown: Callable[[str], str] = _as_in_python) -> Job:
+def window_job(job: Job, options: RatedOptions, shown: Callable[[str], str] = str) -> Job:
     """A job with the options of windows and points; shown: the name of an option in errors."""
     values = complete(options, shown)
     rate, deskew_to = values["rate"], values["deskew_to"]
@@ -378,9 +374,7 @@ def window_job(job: Job, options: RatedOptions, shown: Callable[[str], str] = _a
     return check_deskew(check_batching(job), deskew_to is not None)
 
 
-def output_job(
-    job: Job, options: OutputOptions, shown: Callable[[str], str] = _as_in_python
-) -> Job:
+def output_job(job: Job, options: OutputOptions, shown: Callable[[str], str] = str) -> Job:
     """A job with the options of messages and files; shown: the name of an option in errors."""
     values = complete(options, shown)
     return replace(
@@ -392,7 +386,7 @@ def output_job(
 
 
 def output_request(
-    path: Path | None, options: OutputOptions, shown: Callable[[str], str] = _as_in_python
+    path: Path | None, options: OutputOptions, shown: Callable[[str], str] = str
 ) -> OutputRequest:
     """Where a result goes, and how it is stored; shown: the name of an option in errors."""
     values = complete(options, shown)

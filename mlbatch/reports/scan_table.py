@@ -346,12 +346,9 @@ def _share_cells(
         for rate, count in zip(columns_per_s, columns, strict=True)
     )
     shares = (f"{share:.3f}" for share in (*coverage, *overlap))
-    return ",".join(map(str, (*shares, *missing, *map(_fill_cell, fill))))
-
-
-def _fill_cell(fill: float) -> str:
     # The shortest text of a float32.
-    return UNKNOWN if math.isnan(fill) else str(np.float32(fill))
+    fills = (UNKNOWN if math.isnan(one) else np.float32(one) for one in fill)
+    return ",".join(map(str, (*shares, *missing, *fills)))
 
 
 def merged_table(tables: Sequence[str]) -> str:

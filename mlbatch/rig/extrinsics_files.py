@@ -179,10 +179,6 @@ def _keys(root: Node) -> str:
     return root.shown
 
 
-def _is_transform(root: Node) -> bool:
-    return any("child_frame_id" in one.entries for one in _transforms(root))
-
-
 def _transforms(root: Node) -> tuple[Node, ...]:
     """The messages of a file: one, a list, or those of a TFMessage."""
     if root.kind == "mapping" and "transforms" in root.entries:
@@ -202,10 +198,6 @@ def _transform_edges(root: Node) -> Iterator[Edge]:
             _quaternion(rotation, origin, _numbers(rotation, _XYZW)),
             str(root.file),
         )
-
-
-def _is_ouster(root: Node) -> bool:
-    return any("p_x" in one.entries for one in _transforms(root))
 
 
 def _ouster_edges(root: Node) -> Iterator[Edge]:
@@ -248,12 +240,15 @@ def _refuse_degrees(pose: Node, angles_rad: Sequence[float]) -> None:
 _FORMATS = (
     _Format(
         "TransformStamped",
-        _is_transform,
+        lambda root: any("child_frame_id" in one.entries for one in _transforms(root)),
         _transform_edges,
         "header.frame_id, child_frame_id, transform",
     ),
     _Format(
-        "Ouster", _is_ouster, _ouster_edges, "transforms with source_frame, destination_frame, p_x"
+        "Ouster",
+        lambda root: any("p_x" in one.entries for one in _transforms(root)),
+        _ouster_edges,
+        "transforms with source_frame, destination_frame, p_x",
     ),
     _Format(
         "Autoware", _is_autoware, _autoware_edges, "parent: {child: {x, y, z, roll, pitch, yaw}}"
