@@ -133,7 +133,12 @@ def extract(request: Extraction, progress: Callable[[int, int], object] | None =
     _check_target(request)
     require_library()
     selection = replace(request.selection, identity_extrinsics=True)
-    setup = _discovered(request.recordings, selection)
+    table = StreamTable()
+    opened = open_recordings(request.recordings, table, selection.rig)
+    setup = discover(opened, table, selection, to_convert=False)
+    if not setup.sensors and not setup.noted:
+        # For its reasons.
+        discover(opened, table, selection)
     encodings = ENCODINGS[target.suffix]
     topics = _forwarded(setup.recordings, request, encodings)
     places = Places(setup, encodings)
@@ -177,16 +182,6 @@ def _check_target(request: Extraction) -> None:
             raise UsageError(
                 f"-o: expected another file than the recordings, found {target}; choose another"
             )
-
-
-def _discovered(paths: Sequence[Path], selection: SensorSelection) -> Discovery:
-    table = StreamTable()
-    opened = open_recordings(paths, table, selection.rig)
-    setup = discover(opened, table, selection, to_convert=False)
-    if not setup.sensors and not setup.noted:
-        # For its reasons.
-        discover(opened, table, selection)
-    return setup
 
 
 def _refuse_without_place(places: Places, target: Path) -> None:

@@ -375,7 +375,9 @@ class Files:
         if self.is_due(*place):
             self._contents.append(self.content)
             return None
-        scan = FinishedScan(*place, self.content, None, self._nothing)
+        # Of a scan of another shard nothing is known.
+        nothing = [[0] * len(POINT_COUNTERS) for _ in self.run.sensors]
+        scan = FinishedScan(*place, self.content, None, nothing)
         if self._is_own(*place[:2]) and self._earlier is not None:
             kept = (self._earlier.finished(self._unit(*place)) or {}).get(place)
             if kept is None or kept.content != self.content:
@@ -463,12 +465,6 @@ class Files:
     def _is_own(self, index: int, slice_: int) -> bool:
         shard = self._job.shard
         return shard is None or shard.has(self._number(index, slice_))
-
-    @property
-    def _nothing(self) -> list[list[int]]:
-        """Outcomes of a scan of another shard."""
-        sensors = () if self.run is None else self.run.sensors
-        return [[0] * len(POINT_COUNTERS) for _ in sensors]
 
 
 def _forwarded_content(item: ImuSamples | Message, before: int) -> int:

@@ -147,35 +147,31 @@ def check_deskew(job: Job, is_given: bool) -> Job:
             "--deskew-to: expected --deskew, which moves points, found none; give --deskew imu or "
             "--deskew FILE.tum, or leave it out"
         )
-    if job.deskew == "constant-velocity":
-        _check_velocity(job)
-        return job
-    if job.deskew == "imu" and job.selection.host_clock:
-        raise UsageError(
-            "--deskew imu: expected the clocks of the sensors, which IMU samples have, found "
-            "--clock host; leave one of them out"
-        )
-    if job.deskew and job.deskew != "imu" and not Path(job.deskew).is_file():
-        raise UsageError(
-            "--deskew: expected imu, constant-velocity or the file of a trajectory (TUM), found "
-            f"{job.deskew!r}; check the path"
-        )
-    return job
-
-
-def _check_velocity(job: Job) -> None:
-    """Refuse what would give other velocities than the whole recording, or none."""
-    if job.is_fused:
+    # What would give other velocities than the whole recording, or none.
+    is_by_points = job.deskew == "constant-velocity"
+    if is_by_points and job.is_fused:
         raise UsageError(
             "--deskew constant-velocity: expected windows, which follow each other, found "
             f"--batching {job.batching}; leave one of them out"
         )
-    if job.start is not None:
+    if is_by_points and job.start is not None:
         raise UsageError(
             "--deskew constant-velocity: expected the recording from its beginning, since each "
             "window needs those before it, found --start; leave it out, or give poses "
             "(--deskew FILE.tum)"
         )
+    if job.deskew == "imu" and job.selection.host_clock:
+        raise UsageError(
+            "--deskew imu: expected the clocks of the sensors, which IMU samples have, found "
+            "--clock host; leave one of them out"
+        )
+    is_file = job.deskew not in ("", "imu") and not is_by_points
+    if is_file and not Path(job.deskew).is_file():
+        raise UsageError(
+            "--deskew: expected imu, constant-velocity or the file of a trajectory (TUM), found "
+            f"{job.deskew!r}; check the path"
+        )
+    return job
 
 
 def check_batching(job: Job) -> Job:

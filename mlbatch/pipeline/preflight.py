@@ -79,7 +79,10 @@ def _read_by(job: Job) -> list[Path]:
 
 def check_disk(job: Job, output: Path) -> str:
     """Raise ExportError if the disk is too small; gives a warning if it may be, else ""."""
-    if _is_limited(job):
+    selection = job.selection
+    in_time = job.start is not None or job.end is not None
+    if in_time or job.max_range_m < math.inf or selection.only or selection.ignore:
+        # The output may be arbitrarily small.
         return ""
     recorded = sum(path.stat().st_size for path in job.recordings if path.is_file())
     if job.shard is not None:
@@ -87,7 +90,7 @@ def check_disk(job: Job, output: Path) -> str:
     if free_bytes(output) >= recorded:
         return ""
     # As a rule there is space for all, and the rig need not be read here.
-    rig = job.selection.rig
+    rig = selection.rig
     sensors = () if rig is None else read_rig(rig, job.recordings).sensors
     if any((sensor.max_range_m or math.inf) < math.inf for sensor in sensors):
         return ""
@@ -96,13 +99,6 @@ def check_disk(job: Job, output: Path) -> str:
         f"disk: {output}: {free_bytes(output) // _BYTES_PER_MB} MB are free for a recording of "
         f"{recorded // _BYTES_PER_MB} MB, which may not be enough"
     )
-
-
-def _is_limited(job: Job) -> bool:
-    """True if the options can make the output arbitrarily small."""
-    selection = job.selection
-    in_time = job.start is not None or job.end is not None
-    return in_time or job.max_range_m < math.inf or bool(selection.only or selection.ignore)
 
 
 def check_report(job: Job, path: Path | None, output: Path | None, name: str) -> None:

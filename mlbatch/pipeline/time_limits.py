@@ -28,10 +28,18 @@ EARLY_UPTIME_NS = WINDOW_NS
 def limits_of(
     start_option: str, start: str | int | None, end_option: str, end: str | int | None
 ) -> tuple[Limit | None, Limit | None, bool]:
-    """Start and end of a run, and True if one of them is a date; options: names for errors."""
+    """Start and end of a run, and True if one of them is a date; options: names for errors.
+
+    Raises UsageError unless start is before end, if both count from the same time.
+    """
     first, first_is_date = time_limit(start_option, start)
     last, last_is_date = time_limit(end_option, end)
-    _refuse_disorder((start_option, end_option), first, last)
+    count_alike = first is not None and last is not None and first.from_t_init == last.from_t_init
+    if first is not None and last is not None and count_alike and last.ns <= first.ns:
+        raise UsageError(
+            f"{end_option}: expected a time after {start_option} ({first.ns / NS_PER_S:g} s), "
+            f"found {last.ns / NS_PER_S:g} s; swap them"
+        )
     return first, last, first_is_date or last_is_date
 
 
@@ -82,17 +90,6 @@ def _whole_ns(option: str, value: object) -> int:
             f"{option}: expected nanoseconds of at most {MOST_S} s, found {ns}; correct it"
         )
     return ns
-
-
-def _refuse_disorder(options: tuple[str, str], first: Limit | None, last: Limit | None) -> None:
-    """Raise UsageError unless start is before end, if both count from the same time."""
-    if first is None or last is None or first.from_t_init != last.from_t_init:
-        return
-    if last.ns <= first.ns:
-        raise UsageError(
-            f"{options[1]}: expected a time after {options[0]} ({first.ns / NS_PER_S:g} s), found "
-            f"{last.ns / NS_PER_S:g} s; swap them"
-        )
 
 
 def refuse_outside(

@@ -9,7 +9,6 @@ from __future__ import annotations
 import threading
 from collections import deque
 from collections.abc import Callable
-from functools import partial
 from types import TracebackType
 from typing import Generic, Protocol, TypeVar
 
@@ -158,16 +157,13 @@ class OrderedWorkers(Generic[Task]):
     def _in_order(self, ordered: int, number: int, stage: Callable[[], None]) -> None:
         """Run an ordered stage of a task once all earlier tasks have done theirs."""
         with self._changed:
-            self._wait(partial(self._is_next, ordered, number))
+            self._wait(lambda: self._past[ordered] == number)
             if self._error is not None:
                 raise _Stopped
         stage()
         with self._changed:
             self._past[ordered] += 1
             self._changed.notify_all()
-
-    def _is_next(self, ordered: int, number: int) -> bool:
-        return self._past[ordered] == number
 
     def _fail(self, number: int, error: BaseException) -> None:
         """Stop all, once earlier tasks are done: one of them may fail as well."""
