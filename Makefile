@@ -9,7 +9,7 @@
 #   make lint    the first three of them
 #   make docs    the documentation as a site, build/site/index.html
 #   make bench   how fast it is here (BENCH="--case dual-4 --peer-python PYTHON")
-#   make test-consumers   programs of others read our outputs, each in an environment of its own
+#   make test-consumers   third-party programs read our outputs, each in its own environment
 #   make odometry   KISS-ICP on windows and on fused sweeps, on simulated rigs (docs/does-it-help.md)
 #   make casestudy   lidar-inertial odometry of one and two lidars (docs/does-it-help.md)
 #   make fuzz    a million mutated inputs on all cores (INPUTS=..., SEED=..., MINUTES=...)
