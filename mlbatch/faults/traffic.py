@@ -167,7 +167,7 @@ def _every_second(chosen: BoolArray) -> BoolArray:
 
 
 def _move_behind(traffic: Traffic, rows: I64Array, other: Traffic, other_rows: I64Array) -> None:
-    """Give packets the receive times of others, and places right behind them."""
+    """Give packets the receive times of other packets, and places right behind those."""
     traffic.batch.host_ns[rows] = other.batch.host_ns[other_rows]
     traffic.key_ns[rows] = other.key_ns[other_rows]
     traffic.order[rows] = other.order[other_rows] + 1
