@@ -1,10 +1,9 @@
 """An output of `convert` as a recording: its points become packets once more.
 
 Points are in the body frame and stay there. A packet is a column of one lidar (`ros.point_packets`,
-version 2). npz stores the columns; in other
-formats the points of one time are a column. Points after the end of their window, which began
-before it, get its last nanosecond, and a label of each point states its own time. Receive times are
-those of the columns, so that all lidars come in order.
+version 2). npz stores the columns; in other formats the points of one time are a column. Points
+after the end of their window, which began before it, get its last nanosecond, and a label of each
+point states its own time. Receive times are those of the columns, so that all lidars come in order.
 """
 
 from __future__ import annotations
