@@ -152,6 +152,7 @@ LOWEST = ("readers/", "ros/", "writers/")
 POSES = (
     "poses/",
     "cli/test_calibrate.py",
+    "contract/test_blocks.py",
     "golden/test_digests.py",
     "page/",
     "pipeline/test_inspect.py",

@@ -45,7 +45,6 @@ JUMP: Options = {"on-jump": "split", "fault": "jump:ouster_111:37s@0.3s", "keep-
 DROP: Options = {"fail-on": "loss>1%", "fault": "drop:ouster_111:20%"}
 ROWS = {
     "a1": Row(),
-    "a2": Row(),
     # Crashed and killed sessions are tried again once; exit codes 1 and 2 are final.
     "crash": Row("failed", 2, "SIGSEGV", ()),
     "cut": Row(line="cut_off"),
@@ -53,9 +52,7 @@ ROWS = {
     "killed": Row(attempts=2),
     "lossy": Row("failed", 1, "limit exceeded: loss>1%", options=DROP),
     "npz": Row(suffix="", options={"format": "npz"}),
-    "ply": Row(suffix="", options={"format": "ply"}),
     "rosbag1": Row(suffix=".bag", options={"format": "rosbag1"}),
-    "rosbag2": Row(suffix="", options={"format": "rosbag2"}),
     "segments": Row(parts=(".seg1", ".seg2"), options=JUMP),
 }
 WAYS = ("threads", "dask", "remote")

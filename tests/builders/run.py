@@ -83,10 +83,10 @@ def _parser(first: str = "") -> TyperGroup:
     return made
 
 
-def command(*words: str | Path) -> Outcome:
-    """Run `mlbatch` with these words in this process."""
+def command(*words: str | Path, together: bool = False) -> Outcome:
+    """Run `mlbatch` with these words in this process; together: both outputs are `out`."""
     out = io.StringIO()
-    err = io.StringIO()
+    err = out if together else io.StringIO()
     before = sys.argv
     sys.argv = ["mlbatch", *map(str, words)]
     code: object = 0
