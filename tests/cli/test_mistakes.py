@@ -129,6 +129,8 @@ def write_timed_sessions(folder: Path) -> None:
     write_session(folder / "uptimes", power_on, twin(other, 222))
     write_session(folder / "one_window", Unit(turns=1, begin_ns=EPOCH_NS))
     write_session(folder / "two_turns", Unit(turns=2))
+    write_session(folder / "brief", Unit(turns=1), twin(Unit(turns=1), 222))
+    write_session(folder / "twelve_turns", Unit(turns=12))
     later = Unit(begin_ns=Unit().begin_ns + 5 * NS_PER_S, first_frame=55)
     write_session(folder / "gap", Unit(turns=6), later)
     second = Unit(turns=10)

@@ -13,11 +13,13 @@ from mcap.reader import make_reader
 from rosbags import rosbag1
 
 from mlbatch.errors import ExportError
-from mlbatch.types import IMU, Message, Topic
+from mlbatch.ros.encoding import Wire
+from mlbatch.types import IMU, PACKED_ROOM, Message, PackedPoints, Topic
 from mlbatch.writers import extras, open_writer, plugin, report_paths
 from mlbatch.writers.base import WriterOptions
 from mlbatch.writers.formats import format_names
-from mlbatch.writers.message_writer import static_edges
+from mlbatch.writers.message_writer import CloudMessage, static_edges
+from mlbatch.writers.point_layouts import CLOUD_LAYOUTS
 from tests.builders.bags import Body
 from tests.builders.rosbag1 import definition_of
 from tests.builders.scans import (
@@ -221,6 +223,19 @@ def test_messages_that_fill_the_memory_do_not_wait(name: str, tmp_path: Path) ->
     assert found[0] == ("/tf_static", 0)
     notes = [log_ns for topic, log_ns in found if topic == "/note"]
     assert notes == list(range(20))
+
+
+@pytest.mark.parametrize("frame", ["base_link", "f" * 2 * PACKED_ROOM])
+def test_packed_points_become_the_message_of_arrays(frame: str) -> None:
+    scan = dense_scan()
+    layout = CLOUD_LAYOUTS["standard"]
+    end = PACKED_ROOM + scan.points * layout.step
+    buffer = np.zeros(end + 1, np.uint8)
+    layout.pack(scan, buffer[PACKED_ROOM:end].view(layout.dtype))
+    packed = PackedPoints(buffer, PACKED_ROOM, end, (scan.points,))
+    cloud = CloudMessage(layout, frame, Wire)
+    from_arrays = cloud.message(scan, 5, True).tobytes()
+    assert cloud.message(replace(scan, packed=packed), 5, True).tobytes() == from_arrays
 
 
 # -- one container ------------------------------------------------------------------------------

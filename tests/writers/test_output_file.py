@@ -98,6 +98,21 @@ def test_bytes_of_a_refused_write_go_through_the_cache(
     assert not direct.is_direct
 
 
+def test_a_full_disk_is_an_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(descriptor: int, data: bytes, position: int) -> int:
+        raise OSError(errno.ENOSPC, "full")
+
+    path = tmp_path / "file"
+    path.write_bytes(b"")
+    descriptor = os.open(path, os.O_RDWR)
+    direct = DirectWrites(descriptor, 0)
+    monkeypatch.setattr(os, "pwrite", full)
+    with pytest.raises(OSError, match="full"):
+        direct.put(content(STAGE_BYTES, 1))
+    os.close(descriptor)
+    assert path.read_bytes() == b""
+
+
 def test_large_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(output_file, "_DROP_BYTES", 3 * BLOCK_BYTES)
     parts = [content(length, length) for length in (5000, 1, 9000, 40_000, 0, 3, 70_001)]
