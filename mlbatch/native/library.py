@@ -26,6 +26,8 @@ _HEADER = re.sub(
     flags=re.DOTALL,
 )
 _ABI = int(re.findall(r"#define MLBATCH_ABI (\d+)", _HEADER)[0])
+# What pointers lead to besides arrays.
+_IN_MEMORY = (ctypes.Structure, ctypes.Array)
 _FUNCTION = re.compile(r"EXPORT (\w+) (mlbatch_\w+)\((.*?)\);", re.DOTALL)
 _STRUCT = r"typedef struct {([^}]*)} %s;"
 _MEMBER = re.compile(r"(?:const )?(\w+) (\*?)(\w+)(?:\[(\d+)\])?;")
@@ -50,16 +52,14 @@ class Struct(ctypes.Structure):
 
     def __setattr__(self, name: str, value: Any) -> None:
         """Point to an array or a struct, and keep it; or set a number."""
-        place = value
+        # Members are descriptors of the class: they hide entries of the same name.
         if isinstance(value, np.ndarray):
-            place = address(value)
-        elif isinstance(value, ctypes.Structure | ctypes.Array):
-            place = ctypes.addressof(value)
-        kept = vars(self).setdefault("kept", {})
-        kept.pop(name, None)
-        if place is not value:
-            kept[name] = value
-        super().__setattr__(name, place)
+            self.__dict__[name] = value
+            value = address(value)
+        elif isinstance(value, _IN_MEMORY):
+            self.__dict__[name] = value
+            value = ctypes.addressof(value)
+        super().__setattr__(name, value)
 
 
 class _Pointer:

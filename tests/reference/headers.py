@@ -29,7 +29,7 @@ GOOD, BAD_HEADER = 0, 2
 
 def _of(table: HeaderTable, name: str) -> Any:
     """An array of a table, as the vendor gave it."""
-    return vars(table)["kept"].get(name)
+    return vars(table).get(name)
 
 
 @dataclass
