@@ -81,7 +81,7 @@ def read_started(folder: Path) -> dict[str, str]:
 
 
 def write_started(folder: Path, key: dict[str, str]) -> None:
-    """Note the key of a run, before it."""
+    """Write the key of a run before the run begins."""
     write_text(folder / STARTED_JSON, json.dumps(key, indent=1, ensure_ascii=False) + "\n")
 
 
