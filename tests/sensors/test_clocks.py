@@ -18,7 +18,14 @@ from mlbatch.arrays import I64Array
 from mlbatch.lidar.interface import NeighbourStream
 from mlbatch.sensors.robosense.models import BPEARL_V3, BPEARL_V4
 from mlbatch.sensors.robosense.packets import times_ns as robosense_ns
-from mlbatch.sensors.velodyne.clock import HOUR_NS, absolute_ns, clock_offset_ns, pulse, rmc_ns
+from mlbatch.sensors.velodyne.clock import (
+    HOUR_NS,
+    absolute_ns,
+    clock_offset_ns,
+    pulse,
+    rmc_ns,
+    rotor_speed,
+)
 from mlbatch.simulate.hesai.encode import HesaiSpec, date_field
 from mlbatch.simulate.hesai.models import EPOCH, SINCE_1900
 from mlbatch.simulate.velodyne.encode import VelodyneSpec
@@ -113,6 +120,11 @@ def test_position_packets_override_receive_times() -> None:
 
 def test_nothing_is_no_offset() -> None:
     assert clock_offset_ns(np.zeros((0, 1206), np.uint8), np.zeros(0, np.int64), []) == 0
+
+
+def test_the_speed_of_one_packet_is_that_within_it() -> None:
+    one = np.zeros(1, np.int64)
+    assert [rotor_speed(one, one, rough) for rough in (3.5e-4, None, 0.0)] == [3.5e-4, None, None]
 
 
 def test_what_positions_say_of_the_pulse() -> None:

@@ -156,6 +156,7 @@ VELODYNE_XML: list[tuple[str | bytes, str]] = [
     *((xml_of(entries(64, **changes)), text) for changes, text in VELODYNE_POINT),
     (xml_of(entries(63)), "lasers: expected ids 0 to 63, found no laser 63"),
     (xml_of([]).replace("0.2<", "0.2<!-- rotCorrection_ --><"), "DB.points_: expected 1 to 128"),
+    (xml_of(entries(64), [2] * 64), "DB.enabled_: expected at most 128 items of 0 or 1"),
     (xml_of(entries(64), [0] * 64), "DB.enabled_: expected enabled lasers, found none"),
     (xml_of(entries(64), lsb_cm=20), "DB.distLSB_: expected 0.05 to 2 cm, found 20"),
     (xml_of(entries(64))[:-200], "expected XML, found"),
@@ -167,6 +168,7 @@ VELODYNE_XML: list[tuple[str | bytes, str]] = [
 HESAI_LINE: list[tuple[int, list[str], str]] = [
     (2, ["1,0,0"], "line 3: expected every channel once, found channel 1 again"),
     (9, [], "line 16: expected channels 1 to 16, found no channel 9"),
+    (4, ["4,abc,0"], "line 5: expected elevation from -90 to 90 deg, found abc"),
     (4, ["4,nan,0"], "line 5: expected elevation from -90 to 90 deg, found nan"),
     (4, ["4,0,-361"], "line 5: expected azimuth from -360 to 360 deg, found -361"),
     (1, ["129,0,0"], "line 2: expected a channel from 1 to 128, found 129"),
@@ -242,6 +244,7 @@ OUSTER_KEY: list[tuple[tuple[str, ...], object, str]] = [
     ((FORMAT, "column_window"), [0, 1024], r"expected .*0 to 1023, found \[0, 1024\]"),
     ((FORMAT, "column_window"), [0], "expected .*, found 1 entries"),
     ((FORMAT, "udp_profile_lidar"), "RNG99", "expected one of LEGACY, .*RNG99"),
+    ((FORMAT, "udp_profile_lidar"), 7, "expected a text, found 7"),
     ((FORMAT, "header_type"), "ODD", "expected STANDARD or FUSA, found ODD"),
     (("sensor_info", "prod_sn"), "12x4", "expected a serial number in digits"),
     (("config_params", "udp_port_lidar"), 70000, "expected .*65535, found 70000"),

@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 from rosbags.typesys import get_types_from_msg
 
+from mlbatch.errors import RecordingError
 from tests.builders import rosbag2
 from tests.builders.bags import (
     OUSTER_ROS1,
@@ -267,3 +268,22 @@ def test_messages_that_cannot_be_read_are_counted(name: str, tmp_path: Path) -> 
         "of a message, found 6; it was cut off, or is of another type"
     )
     assert second.startswith("/q: ")
+
+
+@pytest.mark.parametrize("name", [*ONE_OF_EACH, "MCAP, lz4", "ROS 1, none"])
+def test_damaged_bytes_are_noted_or_refused_in_one_line(name: str, tmp_path: Path) -> None:
+    bag = BAGS[name]
+    path = bag.write(tmp_path, fixture_messages(bag.encoding)[:120])
+    content, rng = path.read_bytes(), random.Random(4)
+    for _ in range(40):
+        damaged = bytearray(content)
+        for _ in range(rng.choice([1, 6, 30])):
+            at, size = rng.randrange(100, len(damaged) - 40), rng.choice([1, 4, 40])
+            damaged[at : at + size] = rng.randbytes(size)
+        path.write_bytes(damaged[: rng.choice([len(damaged), rng.randrange(100, len(damaged))])])
+        line = ""
+        try:
+            read(open_bag(path))
+        except RecordingError as err:
+            line = str(err)
+        assert "\n" not in line
