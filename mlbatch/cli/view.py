@@ -52,7 +52,9 @@ def view(
     begin, total, job = _source(sources, values)
     title = ", ".join(path.name or str(path) for path in sources)
     with interruptible():
-        scans = ViewScans(begin, _print_error)
+        scans = ViewScans(
+            begin, lambda text: typer.echo(f"mlbatch: error: {one_line(text)}", err=True)
+        )
         try:
             expected = None if job is None else _expected(job, scans.first)
             with ViewServer(title, scans, total, port, expected) as server:
@@ -134,7 +136,3 @@ def _windows_of(table: str) -> int:
     from mlbatch.outputs.table import read_table
 
     return len(np.unique(read_table(table, "scans.csv")["start_ns"]))
-
-
-def _print_error(text: str) -> None:
-    typer.echo(f"mlbatch: error: {one_line(text)}", err=True)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 from mlbatch.errors import MlbatchError
 from mlbatch.readers import has_packets
@@ -34,26 +34,21 @@ class RecordingReport:
     last_host_ns: int | None
 
 
-@dataclass(slots=True)
 class TopicCounter:
     """Counts the messages of topics without packets."""
 
-    # Messages, first and last log time.
-    _counts: dict[tuple[str, str], tuple[int, int, int]] = field(default_factory=dict)
-
-    @classmethod
-    def subscribed(cls, recordings: Sequence[Recording], streams: Iterable[str]) -> TopicCounter:
-        """A counter of all topics of recordings; streams: topics that are counted as packets."""
+    def __init__(self, recordings: Sequence[Recording], streams: Iterable[str]) -> None:
+        """Subscribe to all topics of recordings but `streams`, which are counted as packets."""
         left_out = frozenset(streams)
-        counter = cls()
+        # Messages, first and last log time.
+        self._counts: dict[tuple[str, str], tuple[int, int, int]] = {}
         for recording in recordings:
             others = [
                 one for one in recording.topics if one.name not in left_out and not has_packets(one)
             ]
             recording.keep = frozenset(topic.name for topic in others)
             for topic in others:
-                counter._counts[topic.name, topic.type] = (0, 0, 0)
-        return counter
+                self._counts[topic.name, topic.type] = (0, 0, 0)
 
     def add(self, messages: Iterable[Message]) -> None:
         """Count messages."""

@@ -344,12 +344,17 @@ def inspect(
         to_convert=False,
     )
     early = frozenset(discovery.sampler.kinds)
-    topics = TopicCounter.subscribed(discovery.recordings, (one.topic for one in table.streams))
+    topics = TopicCounter(discovery.recordings, (one.topic for one in table.streams))
     cloud_times = CloudTimes(discovery)
     measured = _measure(discovery, topics, cloud_times, progress, whole=whole)
     types = packet_types(discovery.recordings)
-    if not discovery.sampler.kinds and not types:
-        _refuse_damaged(discovery)
+    for recording in () if discovery.sampler.kinds or types else discovery.recordings:
+        # Damage is all that it contains.
+        if not recording.topics and recording.notes:
+            raise RecordingError(
+                f"{recording.path}: expected packets or messages, found none "
+                f"({'; '.join(recording.notes)}); record or copy it again"
+            )
     streams = tuple(
         _stream_report(discovery, kind, measured, types) for kind in discovery.sampler.kinds
     )
@@ -445,24 +450,13 @@ def _selector(table: StreamTable, sensor: DetectedSensor) -> StreamSelector:
     )
 
 
-def _refuse_damaged(discovery: Discovery) -> None:
-    """Raise RecordingError if damage is all that recordings contain."""
-    for recording in discovery.recordings:
-        if not recording.topics and recording.notes:
-            raise RecordingError(
-                f"{recording.path}: expected packets or messages, found none "
-                f"({'; '.join(recording.notes)}); record or copy it again"
-            )
-
-
 def _notes(discovery: Discovery) -> Iterator[str]:
     """Notes on damage, times of clouds, calibrations, contradictions, shared addresses, lidars."""
-    for recording in discovery.recordings:
-        for text in recording.notes:
-            yield f"{recording.path.name}: {text}"
-    for recording in discovery.recordings:
-        for text in recording.verdicts if isinstance(recording, CloudRecording) else ():
-            yield f"{recording.path.name}: {text}"
+    texts = [(recording, text) for recording in discovery.recordings for text in recording.notes]
+    clouds = [one for one in discovery.recordings if isinstance(one, CloudRecording)]
+    texts += [(recording, text) for recording in clouds for text in recording.verdicts]
+    for recording, text in texts:
+        yield f"{recording.path.name}: {text}"
     yield from discovery.unusable
     for note in discovery.notes:
         if note.code not in _CONVERSION_ONLY:
