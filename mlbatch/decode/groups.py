@@ -402,7 +402,7 @@ def _labels(source: Source, lidar_id: int) -> npt.NDArray[np.void]:
 
 
 def _require_inside(lidar: Lidar, table: PixelTable) -> None:
-    """Raise RigError unless all pixels are inside of the records and of the channels."""
+    """Raise RigError unless pixels are in records, of known channels, and not too many or large."""
     runs = {tuple((run.channel, run.channels) for run in layout.runs) for layout in table.returns}
     is_known = (
         len(table.returns) == lidar.returns <= _MOST_RETURNS

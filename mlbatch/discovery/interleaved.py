@@ -232,7 +232,7 @@ def _of_two_clocks(packets: _Packets) -> Pair | None:
 
 
 def _is_continued(packets: _Packets, parts: Sequence[I64Array]) -> bool:
-    """True if most packets, but the last of each part, are continued in their part."""
+    """True if most packets have their successor in the same part; the last ones do not count."""
     expected = sum(max(len(rows) - 1, 0) for rows in parts)
     continued = sum(int(packets.continued(rows).any(axis=1).sum()) for rows in parts)
     return expected >= _MIN_CONTINUED and continued >= _CONTINUED * expected

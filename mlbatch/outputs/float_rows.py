@@ -90,7 +90,7 @@ class RowReader(ScanReader):
         self._slices = metadata.slices or 1
 
     def scan(self, file: ScanFile) -> StoredScan:
-        """One scan, checked against the others."""
+        """Return the scan of a file, whose name is checked; times.txt has its start."""
         is_kitti = file.suffix == KITTI_SUFFIX
         rows = _rows(file.read(), 4 if is_kitti else 5)
         times = None if is_kitti else self._times(file, len(rows))

@@ -168,7 +168,8 @@ def _only_file(path: Path, suffix: str) -> ScanFile:
 def _files_of(log: CheckLog, folder: Path, suffix: str, sensor: str | None) -> Iterator[ScanFile]:
     for path in entries(folder):
         where = path.name if sensor is None else f"{sensor}/{path.name}"
-        if path.suffix not in _OUTPUTS or path.is_dir():
+        is_output = path.name.endswith(suffix) or path.suffix in _OUTPUTS
+        if not is_output or path.is_dir():
             continue
         log.ok("names")
         # A second file of a scan, which its reader looks for.

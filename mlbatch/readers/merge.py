@@ -208,7 +208,7 @@ class _Feed:
 def _interleave(
     ready: list[tuple[PacketBatch, I64Array]], out: U8Array
 ) -> tuple[PacketBatch, U8Array]:
-    """One batch in order of keys, its payloads copied to `out` (replaced if too small)."""
+    """Join batches: packets by their keys, payloads in `out` or, if too small, in a new array."""
     size = np.concatenate([batch.size for batch, _ in ready])
     end = np.cumsum(size)
     start = end - size

@@ -38,9 +38,9 @@ _LEDGERS = (
     ("columns", "decoded", "written", "dropped"),
 )
 _OUTCOMES = ("no_return", "range", "box", "repeated", "written")
-# Windows without a scan.
 # Least fill of a scan that is not underfilled.
 _UNDERFILLED = 0.5
+# Windows without a scan.
 _UNWRITTEN = ("empty", "dropped_incomplete")
 # Sections that differ between runs on the same recording.
 _MACHINE = ("timing", "inputs", "command", "identity", "map")

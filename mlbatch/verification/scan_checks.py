@@ -50,7 +50,7 @@ class Grid:
         return whole + (rest > 0)
 
     def number(self, stamp_ns: int) -> int:
-        """The slice of a stamp."""
+        """Return the number q of the slice that contains a stamp."""
         q = stamp_ns * self.rate.numerator * self.slices // (_NS * self.rate.denominator)
         return q + 1 if self.bound(q + 1) <= stamp_ns else q
 

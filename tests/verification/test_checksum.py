@@ -77,7 +77,7 @@ def test_other_values_in_a_sound_file_are_found(
         seen.add(key)
 
     # Without the layout of records, so that scans have arrays.
-    monkeypatch.setattr(conversion, "Decoder", lambda *words: Decoder(*words[:6]))
+    monkeypatch.setattr(conversion, "Decoder", lambda *words, **own: Decoder(*words[:6], **own))
     monkeypatch.setattr(DecodeWorker, "decode", changed)
     monkeypatch.setattr(Conversion, "account", as_before)
     target = tmp_path / kind

@@ -152,7 +152,7 @@ def _of_port(packets: U8Array, port: int) -> U8Array:
 
 
 def _difop(packets: U8Array) -> Difop:
-    """Device packet of the median of each byte of packets (k, 1248), robust to damage."""
+    """Return the device packet whose bytes are medians over packets (k, 1248), against damage."""
     median_packet = np.sort(packets, axis=0)[len(packets) // 2]
     serial = median_packet[_SERIAL].tobytes()
     return Difop(
