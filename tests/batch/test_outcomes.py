@@ -140,9 +140,14 @@ def by_dask(data: Dataset, folder: Path) -> Batch:
     ) as cluster:
         words = ("--scheduler", cluster.scheduler_address)
         driver = start(data, out, *words)
-        wait_for(
-            lambda: len(list(out.glob("*/session.json"))) >= 2 and list(out.glob("*/started.json"))
-        )
+
+        def is_due() -> bool:
+            # A session whose worker is killed counts its attempts anew.
+            running = {path.parent.name for path in out.glob("*/started.json")}
+            ended = len(list(out.glob("*/session.json")))
+            return ended >= 2 and bool(running) and running.isdisjoint(("crash", "killed"))
+
+        wait_for(is_due)
         os.kill(cluster.workers[0].process.pid, signal.SIGKILL)
         first = end(driver)
         before = files_of(out)

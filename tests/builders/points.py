@@ -146,8 +146,9 @@ HEAD += [("number", "<u4"), ("count", "<u2"), ("rest", "<u2")]
 
 def read_packets(packets: U8Array) -> Any:
     """Packets (P, size) of our own making as records, by the layout that docs/formats states."""
-    slots = (packets.shape[1] - HEAD_BYTES) // 20
+    # A tuple, since numpy 1 takes the shape 1 for none.
+    slots = ((packets.shape[1] - HEAD_BYTES) // 20,)
     planes = [(name, "<f4", slots) for name in ("x", "y", "z", "level")]
     planes += [("ring", "<u2", slots), ("return_type", "u1", slots), ("tag", "u1", slots)]
-    data = np.ascontiguousarray(packets[:, : HEAD_BYTES + 20 * slots])
+    data = np.ascontiguousarray(packets[:, : HEAD_BYTES + 20 * slots[0]])
     return data.view(np.dtype([*HEAD, *planes])).reshape(-1).view(np.recarray)
