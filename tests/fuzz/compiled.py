@@ -21,6 +21,7 @@ from mlbatch.decode.groups import Source
 from mlbatch.decode.packet_ring import PacketRing
 from mlbatch.lidar.headers import content_keys, hash_factors
 from mlbatch.lidar.interface import Lidar
+from mlbatch.motion.se3 import exp_rotation
 from mlbatch.native.arena import PacketArena
 from mlbatch.native.library import trouble
 from mlbatch.pipeline.sensor import new_ring
@@ -138,7 +139,12 @@ def _decode(data: bytes, folder: Path) -> None:
     place = rng.choice(every, _COLUMNS)
     word = words_of(lidar, rng, _COLUMNS)
     stamp_ns = np.sort(rng.integers(START_NS, END_NS, _COLUMNS))
-    moves = rng.normal(size=(_COLUMNS, 3, 4)).astype(np.float32) if rng.random() < 0.3 else None
+    moves = None
+    if rng.random() < 0.3:
+        # Rigid ones: others may move far points near, with the rounding of far ones.
+        turns = exp_rotation(rng.normal(size=(_COLUMNS, 3)))
+        shifts_m = rng.normal(size=(_COLUMNS, 3, 1))
+        moves = np.concatenate([turns, shifts_m], axis=2).astype(np.float32)
     columns = WindowColumns(stamp_ns, np.zeros(_COLUMNS, np.int64), place, word, moves)
     pair.check(Window(0, 0, START_NS, END_NS, True, 0, columns))
 
