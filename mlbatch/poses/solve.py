@@ -514,7 +514,7 @@ def after_move(pose: Pose, move: Pose) -> Pose:
 
 
 def _follow_votes(problem: Problem, state: State) -> bool:
-    """Move each lidar to where its stems are those of the others; return whether one was moved."""
+    """Move each lidar to where its stems meet the others'; return whether one was moved."""
     from mlbatch.poses.stems import best_move
 
     followed = False

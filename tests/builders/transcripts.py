@@ -75,9 +75,15 @@ class Transcript:
         for step in self.steps:
             step.check(shell, folder)
 
+    def check_with(self, inputs: Path, shell: Shell, folder: Path) -> None:
+        """Type all of them in a folder with links to inputs."""
+        for path in inputs.iterdir():
+            (folder / path.name).symlink_to(path)
+        self.check(shell, folder)
+
 
 def transcripts(name: str, **variables: str) -> Mapping[str, Transcript]:
-    """Those of a file, by their names; variables: texts for `$NAME` in commands."""
+    """Return the transcripts of a file by name; variables: texts for `$NAME` in commands."""
     found: dict[str, list[Step]] = {}
     steps: list[Step] | None = None
     for line in (FOLDER / f"{name}.txt").read_text(encoding="utf-8").splitlines():

@@ -205,9 +205,7 @@ def test_mistake(shell: Shell, place: Path, name: str) -> None:
 
 @pytest.mark.parametrize("name", SESSIONS)
 def test_session(monkeypatch: pytest.MonkeyPatch, place: Path, tmp_path: Path, name: str) -> None:
-    for path in place.iterdir():
-        (tmp_path / path.name).symlink_to(path)
-    SESSIONS[name].check(Shell(monkeypatch, tmp_path), tmp_path)
+    SESSIONS[name].check_with(place, Shell(monkeypatch, tmp_path), tmp_path)
 
 
 @pytest.mark.parametrize("name", OPTIONS)

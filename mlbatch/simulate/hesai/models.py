@@ -2,7 +2,7 @@
 
 Source: docs/sources/hesai.md sections 1 (versions), 2 (layout) and 5 (times of blocks). Where
 fields are, and when beams fire, is taken from the rows in `mlbatch/sensors/hesai/models.py`, which
-tests compare with bytes laid out by hand. Pandar20: HesaiTechnology/HesaiLidar_General_SDK.
+tests compare with the tables of that page. Pandar20: HesaiTechnology/HesaiLidar_General_SDK.
 """
 
 from __future__ import annotations

@@ -2,7 +2,7 @@
 
 Source: docs/sources/robosense.md sections 1 to 4. Where fields are, firing times, lenses, units and
 modes are taken from the rows in `mlbatch/sensors/robosense/models.py`, which tests compare with
-bytes laid out by hand.
+the tables of that page.
 """
 
 from __future__ import annotations
